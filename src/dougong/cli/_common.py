@@ -1,0 +1,77 @@
+"""The options every command has, and what they mean."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Group, Parameter
+
+from dougong.errors import InputError
+
+GLOBAL = Group("Global options", sort_key=100)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Common:
+    """Global options."""
+
+    quiet: Annotated[bool, Parameter(group=GLOBAL, negative="", show_default=False)] = False
+    """Say nothing on stderr but errors."""
+    json: Annotated[bool, Parameter(group=GLOBAL, negative="", show_default=False)] = False
+    """Print one JSON document on stdout and nothing else."""
+    threads: Annotated[int | None, Parameter(group=GLOBAL)] = None
+    """Threads to use; default: all this process may use."""
+    memory: Annotated[str | None, Parameter(group=GLOBAL)] = None
+    """Memory to stay under, for example 4GB; a job that needs more is refused at once."""
+    engine: Annotated[str, Parameter(group=GLOBAL)] = "local"
+    """Who runs the work. This version knows: local."""
+    work: Annotated[Path | None, Parameter(group=GLOBAL)] = None
+    """Folder for finished steps, so that a cancelled run goes on; default: beside the output."""
+    seed: Annotated[int, Parameter(group=GLOBAL)] = 0
+    """Seed of everything random."""
+    debug: Annotated[bool, Parameter(group=GLOBAL, negative="", show_default=False)] = False
+    """Show the traceback of an error."""
+
+    def memory_bytes(self) -> int | None:
+        """Return ``--memory`` in bytes.
+
+        Raises
+        ------
+        InputError
+            The text is not a number with a unit.
+        """
+        if self.memory is None:
+            return None
+        found = re.fullmatch(r"([0-9]*\.?[0-9]+)\s*([KMGT]?)(i?)B?", self.memory.strip(), re.I)
+        if not found or float(found[1]) <= 0:
+            msg = f"--memory needs a size such as 4GB or 800MB, got {self.memory!r}."
+            raise InputError(msg)
+        power = "BKMGT".index((found[2] or "B").upper())
+        return int(float(found[1]) * (1024 if found[3] else 1000) ** power)
+
+    def check(self) -> None:
+        """Refuse what this version cannot do.
+
+        Raises
+        ------
+        InputError
+            An unknown engine, or a thread count below one.
+        """
+        if self.engine != "local":
+            msg = (
+                f"--engine {self.engine} is not part of this version, which runs on this "
+                "machine only. Leave the option out or pass --engine local."
+            )
+            raise InputError(msg)
+        if self.threads is not None and self.threads < 1:
+            msg = f"--threads must be 1 or more, got {self.threads}."
+            raise InputError(msg)
+        if self.seed < 0:
+            msg = f"--seed must be 0 or more, got {self.seed}."
+            raise InputError(msg)
+        self.memory_bytes()
+
+
+DEFAULT = Common()

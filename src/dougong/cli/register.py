@@ -1,0 +1,101 @@
+"""``dougong register``: find the transform from one cloud to another."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from dougong import app
+from dougong.cli import _text
+from dougong.cli._common import DEFAULT, Common
+from dougong.cli._shell import DONE, FAILED, UNSURE, Answer, Listener, execute
+
+_EXIT = {"ok": DONE, "ambiguous": UNSURE, "failed": FAILED}
+_Sensor = Literal["lidar", "photogrammetry"]
+
+
+def command(
+    source: Path,
+    target: Path,
+    *,
+    out: Path,
+    source_kind: _Sensor | None = None,
+    target_kind: _Sensor | None = None,
+    coarse: Literal["auto", "plan", "improved-pca", "pca", "sac-ia", "4pcs", "none"] = "auto",
+    fine: Literal["point-to-plane", "point-to-point", "none"] = "point-to-plane",
+    dof: Literal["auto", "4", "6"] = "auto",
+    filtered: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    yaw_hint: float | None = None,
+    accept_best: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    common: Common = DEFAULT,
+) -> int:
+    """Find the transform from SOURCE's coordinates to TARGET's.
+
+    Always writes registration.json. Exit code 0: ok; 1: no pose was found;
+    3: several poses explain the data equally well.
+
+    Example: dougong register scan.laz drone.laz --out result
+
+    Parameters
+    ----------
+    source
+        The cloud that moves; raw or filtered, in any coordinates.
+    target
+        The cloud that stays.
+    out
+        Folder for registration.json and report.html.
+    source_kind
+        Sensor of the source; guessed where it is not given.
+    target_kind
+        Sensor of the target; guessed where it is not given.
+    coarse
+        How a first pose is found; sac-ia: alike features, 4pcs: congruent sets of four points;
+        none: SOURCE is in place to a few decimetres already.
+    fine
+        How the pose is refined.
+    dof
+        4: levelled, 6: rigid; auto: 6 with a gravity prior, 4 only where both prove levelled.
+    filtered
+        The inputs are clean already; nothing is dropped as noise.
+    yaw_hint
+        About how far SOURCE is turned about the vertical, degrees: picks among equal poses.
+    accept_best
+        Exit with 0 and take the best pose where several are possible; the status stays.
+    overwrite
+        Replace a result that exists already.
+    """
+
+    def work(progress: Listener) -> Answer:
+        document = app.register_files(
+            source,
+            target,
+            out,
+            options={
+                "coarse": coarse,
+                "fine": fine,
+                "dof": dof,
+                "filtered": filtered,
+                "yaw_hint_deg": yaw_hint,
+                "accept_best": accept_best,
+            },
+            source_kind=source_kind,
+            target_kind=target_kind,
+            overwrite=overwrite,
+            memory_bytes=common.memory_bytes(),
+            progress=progress,
+        )
+        code = _EXIT[document["status"]]
+        if accept_best and code == UNSURE:
+            code = DONE
+        return Answer(document=document, text=_words(document, out), exit_code=code)
+
+    return execute(common, work)
+
+
+def _words(document: dict[str, Any], out: Path) -> str:
+    return _text.join(
+        _text.registration(document),
+        _text.notes(document["notes"]),
+        f"wrote {out / 'registration.json'} and {out / 'report.html'}",
+    )

@@ -1,0 +1,71 @@
+"""``dougong run``: the main job."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from dougong import app
+from dougong.cli import _text
+from dougong.cli._common import DEFAULT, Common
+from dougong.cli._shell import DONE, UNSURE, Answer, Listener, execute
+
+
+def command(
+    project: Path | None = None,
+    *,
+    out: Path,
+    lidar: Annotated[list[Path] | None, Parameter(negative="")] = None,
+    photogrammetry: Annotated[list[Path] | None, Parameter(negative="")] = None,
+    overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    common: Common = DEFAULT,
+) -> int:
+    """Filter every cloud, register it onto the reference, merge, report.
+
+    The reference is the first photogrammetry cloud, else the first lidar one.
+    A project file may name another. One cloud alone is only filtered.
+
+    Example: dougong run --lidar scan.laz --photogrammetry drone.laz --out result
+
+    Parameters
+    ----------
+    project
+        Project file; `dougong init DIR` writes one.
+    out
+        Folder for the result: merged.copc.laz, clouds, registrations, result.json, report.html.
+    lidar
+        A laser scan; may be given several times.
+    photogrammetry
+        A drone cloud; may be given several times.
+    overwrite
+        Replace a result that exists already.
+    """
+
+    def work(progress: Listener) -> Answer:
+        document = app.run_project(
+            project,
+            out,
+            lidar=lidar or (),
+            photogrammetry=photogrammetry or (),
+            overwrite=overwrite,
+            work=common.work,
+            memory_bytes=common.memory_bytes(),
+            progress=progress,
+        )
+        code = DONE if document["is_settled"] else UNSURE
+        return Answer(document=document, text=_words(document, out), exit_code=code)
+
+    return execute(common, work, kept="Finished filter steps are kept; run it again to go on.")
+
+
+def _words(document: dict[str, Any], out: Path) -> str:
+    parts = []
+    for cloud in document["clouds"]:
+        parts += [f"{cloud['name']} ({cloud['kind']})", _text.stages(cloud["stages"])]
+    parts += [_text.registration(entry) for entry in document["registrations"]]
+    merged = document["merged"]
+    parts.append(
+        f"merged {_text.count(merged['points'])} points of {', '.join(merged['clouds'])} "
+        f"in {document['seconds']['total']:.1f} s; report: {out / 'report.html'}"
+    )
+    return _text.join(*parts, _text.notes(document["notes"]))

@@ -1,0 +1,68 @@
+"""``dougong view``: clouds of any size in the browser."""
+
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from dougong import app
+from dougong.cli import _text
+from dougong.cli._common import DEFAULT, Common
+from dougong.cli._shell import DONE, Answer, Listener, execute
+
+if TYPE_CHECKING:
+    from dougong.app import Viewing
+
+
+def command(
+    *paths: Path,
+    port: int = 0,
+    browser: Annotated[bool, Parameter(negative="--no-browser")] = True,
+    common: Common = DEFAULT,
+) -> int:
+    """Open clouds or a result folder in the browser, at full size, until Ctrl-C.
+
+    The page is served to this computer only (127.0.0.1). COPC files are streamed as they are;
+    other formats are converted to temporary COPC files first, which takes time and memory.
+
+    Example: dougong view result
+
+    Example: dougong view merged.copc.laz scan.laz
+
+    Parameters
+    ----------
+    paths
+        Clouds, or the --out folder of a run, a demo or a registration.
+    port
+        Port of the page; 0: a free one.
+    browser
+        Open the browser; else only print the address.
+    """
+    opened: list[Viewing] = []
+
+    def work(progress: Listener) -> Answer:
+        viewing = app.view(
+            paths, port=port, open_browser=browser, work=common.work, progress=progress
+        )
+        opened.append(viewing)
+        document = viewing.document
+        lines = [f"{', '.join(document['clouds'])}: {_text.count(document['points'])} points"]
+        if browser and not document["is_browser_open"]:
+            lines.append("NO BROWSER COULD BE OPENED here; open this address yourself:")
+        lines += [document["url"], "Ctrl-C ends it."]
+        return Answer(document=document, text=_text.join(*lines, _text.notes(document["notes"])))
+
+    code = execute(common, work)
+    try:
+        if code == DONE:
+            sys.stdout.flush()
+            threading.Event().wait()
+    except KeyboardInterrupt:
+        # This is how a viewer is closed: nothing has failed.
+        return DONE
+    finally:
+        for viewing in opened:
+            viewing.close()
+    return code

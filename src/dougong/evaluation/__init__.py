@@ -1,0 +1,1 @@
+"""Truth to measure against: scenes, metrics and studies."""

@@ -1,0 +1,1 @@
+"""The five generated buildings, and the parts they are put together from."""

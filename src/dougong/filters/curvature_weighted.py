@@ -1,0 +1,325 @@
+"""Curvature-weighted adaptive statistical filter (CWASF): noise out, brackets and eaves kept.
+
+METHOD.md 1.3, equations 1 to 6, in the readings that can work. Kernels are imported when called.
+"""
+
+import math
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from dougong._checks import as_points
+from dougong.errors import InputError
+from dougong.filters import protective
+from dougong.filters.selection import Selection
+from dougong.filters.totals import Totals
+from dougong.params import Parameters
+from dougong.threads import for_blocks
+from dougong.typing import Index, Mask, Values
+
+KIND: Literal["local", "two-pass", "global"] = "local"
+
+_BLOCK = 1 << 13
+_LEAVES = 1 << 9
+"""Points and leaves per task."""
+_LATTICE_STEPS = 1 << 16
+"""At least this many lattice steps in the largest radius: 8 micrometres for 0.3 m."""
+_STATISTIC_STEPS = 1 << 20
+"""Steps that the largest possible statistic is divided into before it is summed."""
+
+
+class CurvatureWeighted(Parameters):
+    """Remove points whose nearest weighted neighbour is unusually far, for their curvature."""
+
+    rule: Literal["paper", "global", "protective"] = "paper"
+    """What "unusual" is measured against: ``paper``, the statistics of the points in the ball round
+    each point; ``global``, those of the whole cloud; ``protective``, the spacing of the surface
+    near each point, with gaps excused along surfaces and lines (docs/denoising.md). It uses alpha,
+    gamma and surface_loss; radii, beta, curvature_0 and tau are the paper's."""
+    surface_loss: Annotated[float, Field(gt=0, lt=0.5)] = 0.025
+    """``protective``: share of the points of a randomly sampled surface that each of its distance
+    tests would take if nothing excused them. More removes more."""
+    reach_m: Annotated[float, Field(gt=0)] | None = None
+    """``protective``: nothing farther is a neighbour; the halo is 11 times this. None: 0.5 m,
+    doubled or halved until it is 5 to 100 median spacings of the cloud."""
+    radius_init_m: Annotated[float, Field(gt=0)] = 0.3
+    """Radius of the ball that curvature and local statistics are taken from."""
+    radius_min_m: Annotated[float, Field(gt=0)] = 0.05
+    """Search radius far below curvature_0 (never reached: at 0 it is 0.096 m by default)."""
+    radius_max_m: Annotated[float, Field(gt=0)] = 0.3
+    """Search radius at high curvature."""
+    beta: Annotated[float, Field(ge=0)] = 30.0
+    """Steepness of the change between the two radii (eq. 4)."""
+    curvature_0: float = 0.05
+    """Surface variation at which the search radius is half way (eq. 4)."""
+    alpha: Annotated[float, Field(ge=0)] = 1.8
+    """How much curvature inflates distances (eq. 5)."""
+    gamma: Annotated[float, Field(ge=0)] = 12.0
+    """How fast it does so (eq. 5)."""
+    tau_min: float = 1.2
+    """Standard deviations above the mean at which the cut lies, at least (eq. 6, printed as c)."""
+    tau_max: float = 1.8
+    """The same, at most."""
+    tau_period: float = 4.0
+    """The k of eq. 6: tau swings with cos(2 pi k curvature)."""
+    solid_voxel_count: Annotated[int, Field(ge=2)] | None = None
+    """Keep a decimated point whose voxel held at least this many, whatever the rule says: it was
+    not alone. None: never. Needs `voxel_count`."""
+
+    @model_validator(mode="after")
+    def _ranges_ascend(self) -> "CurvatureWeighted":
+        for name, low, high in (
+            ("radius_min_m", self.radius_min_m, self.radius_max_m),
+            ("tau_min", self.tau_min, self.tau_max),
+        ):
+            if low > high:
+                msg = f"{name} must not exceed {name.replace('min', 'max')}, got {low} > {high}."
+                raise ValueError(msg)
+        return self
+
+    def weight(self, curvature: Values) -> Values:
+        """Return w (n,) of eq. 5, at least 1."""
+        weight: Values = 1.0 + self.alpha * np.tanh(self.gamma * curvature)
+        return weight
+
+    def radius_m(self, curvature: Values) -> Values:
+        """Return the search radius (n,) of eq. 4."""
+        rise = 1.0 + np.exp(-self.beta * (curvature - self.curvature_0))
+        radius: Values = self.radius_min_m + (self.radius_max_m - self.radius_min_m) / rise
+        return radius
+
+    def tau(self, curvature: Values) -> Values:
+        """Return tau (n,) of eq. 6."""
+        swing = (1.0 - np.cos(2.0 * math.pi * self.tau_period * curvature)) / 2.0
+        tau: Values = self.tau_min + (self.tau_max - self.tau_min) * swing
+        return tau
+
+
+class Lattice(NamedTuple):
+    """Points on whole numbers, sorted into a tree: balls are summed exactly on it."""
+
+    points: NDArray[np.float64]
+    """(n, 3) whole numbers, in steps."""
+    order: Index
+    """(n,) place in the caller's array of each sorted point."""
+    boxes: NDArray[np.float64]
+    """(2 leaves, 6)."""
+    step_m: float
+    """Metres per step; a power of two."""
+
+    def unsorted(self, values: NDArray[np.float64]) -> Values:
+        """Return per-point `values`, given in sorted order, in the caller's order."""
+        result = np.empty_like(values)
+        result[self.order] = values
+        return result
+
+
+def halo_m(params: CurvatureWeighted) -> float:
+    """Return how far the rule reaches: the curvature of the neighbours of the neighbours."""
+    if params.rule == "protective":
+        return protective.halo_m(params.reach_m)
+    return 2.0 * params.radius_init_m + params.radius_max_m
+
+
+def build_lattice(points: ArrayLike, radius_m: float) -> Lattice:
+    """Return `points` (n, 3), rounded to steps of at most radius_m / 2**16, as a tree.
+
+    The steps count from the local origin, so parts of a cloud are rounded alike.
+
+    Raises
+    ------
+    InputError
+        The points spread over more than 2**52 steps.
+    """
+    from dougong.filters.neighbourhood import build_index
+
+    xyz = as_points(points)
+    step_m = 2.0 ** math.floor(math.log2(radius_m / _LATTICE_STEPS))
+    steps = np.rint(xyz / step_m)
+    if len(xyz) and np.abs(steps).max() > 2**52:
+        msg = (
+            f"points reach {np.abs(xyz).max():.3g} m from the local origin, too far for balls of "
+            f"{radius_m} m (at most {2**52 * step_m:.3g} m). Move the origin or drop far points."
+        )
+        raise InputError(msg)
+    return Lattice(*build_index(steps), step_m)
+
+
+def surface_variation(lattice: Lattice, radius_m: float) -> Values:
+    """Return the surface variation (n,) of every point's ball, in sorted order (eq. 1 to 3)."""
+    from dougong.kernels import balls
+
+    n = len(lattice.points)
+    moments = np.zeros((len(lattice.boxes), 9), np.int64)
+    balls.node_moments(lattice.points, moments)
+    variation = np.zeros(n)
+    radius2 = (radius_m / lattice.step_m) ** 2
+
+    def task(first: int, last: int) -> None:
+        balls.ball_variation(
+            lattice.points, lattice.boxes, moments, radius2, first, last, variation
+        )
+
+    if n:
+        for_blocks(len(lattice.boxes) // 2, _LEAVES, task)
+    return variation
+
+
+def least_weighted_distance(lattice: Lattice, curvature: Values, p: CurvatureWeighted) -> Values:
+    """Return the statistic m (n,), metres, in sorted order: eq. 5's least one; inf if none."""
+    from dougong.kernels import balls
+
+    n = len(lattice.points)
+    weight = p.weight(curvature)
+    radii = p.radius_m(curvature) / lattice.step_m
+    least = np.empty(n)
+
+    def task(start: int, stop: int) -> None:
+        balls.least_weighted(lattice.points, lattice.boxes, weight, radii, start, stop, least)
+
+    for_blocks(n, _BLOCK, task)
+    return least * lattice.step_m
+
+
+def _local_statistics(lattice: Lattice, steps: Index, radius_m: float) -> tuple[Values, Values]:
+    """Return mean and deviation (n,) of the `steps` >= 0 (n,) in each point's ball."""
+    from dougong.kernels import balls
+
+    n = len(lattice.points)
+    sums = np.zeros((len(lattice.boxes), 3), np.int64)
+    balls.node_sums(steps, sums)
+    totals = np.zeros((n, 3), np.int64)
+    radius2 = (radius_m / lattice.step_m) ** 2
+
+    def task(first: int, last: int) -> None:
+        balls.ball_totals(lattice.points, lattice.boxes, steps, sums, radius2, first, last, totals)
+
+    if n:
+        for_blocks(len(lattice.boxes) // 2, _LEAVES, task)
+    count = np.maximum(totals[:, 0], 1).astype(np.float64)
+    mean = totals[:, 1] / count
+    spread = totals[:, 2] / count - mean * mean
+    return mean, np.sqrt(np.maximum(spread, 0.0))
+
+
+class _Population(NamedTuple):
+    """The statistic m of n points, in sorted order, and what is usual round each."""
+
+    is_alone: Mask
+    steps: Index
+    """(n,) m in whole steps; -1 where alone."""
+    mean: Values | float
+    deviation: Values | float
+
+
+def _population(lattice: Lattice, curvature: Values, p: CurvatureWeighted) -> _Population:
+    """Return the statistic and its reference population: eq. 5 and what eq. 6 compares with."""
+    least = least_weighted_distance(lattice, curvature, p)
+    is_alone = ~np.isfinite(least)
+    step_m = p.radius_max_m * (1.0 + p.alpha) / _STATISTIC_STEPS
+    steps = np.where(is_alone, -1.0, np.rint(least / step_m)).astype(np.int64)
+    if p.rule == "global":
+        totals = Totals.of(steps[~is_alone])
+        return _Population(is_alone, steps, totals.mean, totals.deviation)
+    return _Population(is_alone, steps, *_local_statistics(lattice, steps, p.radius_init_m))
+
+
+def _is_outlier(lattice: Lattice, curvature: Values, p: CurvatureWeighted) -> Mask:
+    """Return the verdict (n,) of eq. 6 in sorted order. An empty neighbourhood is an outlier."""
+    is_alone, steps, mean, deviation = _population(lattice, curvature, p)
+    is_outlier: Mask = is_alone | (steps > mean + p.tau(curvature) * deviation)
+    return is_outlier
+
+
+def excess(points: ArrayLike, params: CurvatureWeighted | None = None) -> Values:
+    """Return how far points (n, 3) lie above the mean, in units of eq. 6's tau deviations.
+
+    Above 1 the rules ``paper`` and ``global`` remove a point; inf for a point alone. For curves.
+    """
+    p = params or CurvatureWeighted()
+    lattice = build_lattice(points, max(p.radius_init_m, p.radius_max_m))
+    curvature = surface_variation(lattice, p.radius_init_m)
+    is_alone, steps, mean, deviation = _population(lattice, curvature, p)
+    above = (steps - mean) / np.maximum(p.tau(curvature) * deviation, 1e-9)
+    return lattice.unsorted(np.where(is_alone, np.inf, above))
+
+
+def curvature_weighted(
+    points: ArrayLike,
+    params: CurvatureWeighted | None = None,
+    *,
+    voxel_count: ArrayLike | None = None,
+) -> Selection:
+    """Choose the points that have a neighbour about as near as their surroundings do.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 3)
+        Metres, local frame; non-ground points of a laser scan.
+    params : CurvatureWeighted
+    voxel_count : array_like, shape (n,), optional
+        How many points each point stands for after decimation; used by `solid_voxel_count`.
+
+    Returns
+    -------
+    Selection
+        ``curvature`` (n,): surface variation in the ball of radius_init_m, 0 .. 1/3.
+        ``protective`` adds ``removal_margin`` (n,), above 1 for removed points, ``removal_reason``
+        (n,) uint8 (`protective.Taken`) and ``spacing_m`` (n,); its curvature is that of the 12
+        nearest.
+
+    Notes
+    -----
+    Coordinates are rounded to 2**-18 m (for 0.3 m), sums are exact integers, so nothing depends on
+    the order of the points. Cost per ball grows with the square root of the points in it.
+    Tile class: local with a halo of 2 radius_init_m + radius_max_m; ``global`` is two-pass.
+    """
+    p = params or CurvatureWeighted()
+    if p.rule == "protective":
+        return _protective(points, p, voxel_count)
+    lattice = build_lattice(points, max(p.radius_init_m, p.radius_max_m))
+    n = len(lattice.points)
+    if n == 0:
+        return Selection(is_kept=np.zeros(0, bool), attributes={"curvature": np.zeros(0)})
+    curvature = surface_variation(lattice, p.radius_init_m)
+    is_kept = np.empty(n, bool)
+    is_kept[lattice.order] = ~_is_outlier(lattice, curvature, p)
+    if p.solid_voxel_count is not None:
+        is_kept |= _is_solid(voxel_count, n, p.solid_voxel_count)
+    return Selection(is_kept=is_kept, attributes={"curvature": lattice.unsorted(curvature)})
+
+
+def _protective(
+    points: ArrayLike, p: CurvatureWeighted, voxel_count: ArrayLike | None
+) -> Selection:
+    verdict = protective.judge(points, p.alpha, p.gamma, p.surface_loss, p.reach_m)
+    is_kept = verdict.reason == protective.Taken.KEPT
+    reason = verdict.reason
+    if p.solid_voxel_count is not None:
+        is_kept |= _is_solid(voxel_count, len(is_kept), p.solid_voxel_count)
+        reason = np.where(is_kept, protective.Taken.KEPT, reason).astype(np.uint8)
+    return Selection(
+        is_kept=is_kept,
+        attributes={
+            "curvature": verdict.curvature,
+            "removal_margin": verdict.margin,
+            "removal_reason": reason,
+            "spacing_m": verdict.spacing_m,
+        },
+    )
+
+
+def _is_solid(voxel_count: ArrayLike | None, n: int, at_least: int) -> Mask:
+    if voxel_count is None:
+        msg = (
+            f"solid_voxel_count is {at_least} but no voxel_count came with the points. "
+            "Decimate with octree_voxel_grid first, or leave solid_voxel_count out."
+        )
+        raise InputError(msg)
+    counts = np.asarray(voxel_count)
+    if counts.shape != (n,):
+        raise InputError(f"voxel_count must have shape ({n},), got {counts.shape}.")
+    is_solid: Mask = counts >= at_least
+    return is_solid

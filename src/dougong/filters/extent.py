@@ -1,0 +1,61 @@
+"""The extent of a cloud without its isolated far points."""
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, label
+
+from dougong.kernels import raster
+from dougong.typing import Points, Values
+
+_BINS = 64
+_FAR_BINS = 16
+_FEW_POINTS = 16
+_FEW_SHARE = 1e-4
+_FEW_SHARE_OF_SMALL = 0.01
+
+
+def plan_box(points: Points) -> tuple[Values, Values, float]:
+    """Return the box of the cloud in plan, isolated far points left out: low, high, lowest z.
+
+    The box is cut into 64 x 64 bins, and bins less than a quarter of the box apart are one group.
+    A group of at most 1 in 10,000 points (or 16, or 1 in 100, whichever of these two is less) is
+    far; the box shrinks to the others, and again until nothing is far.
+    points (n >= 1, 3), metres; low, high (2,): x and y; lowest: the smallest z inside.
+    """
+    everywhere = np.full(2, np.inf)
+    bounds = _bounds(points, -everywhere, everywhere)
+    while True:
+        low, high = bounds[:2], bounds[2:4]
+        cut = _without_far_bins(points, low, high)
+        if cut is None:
+            return low, high, float(bounds[4])
+        before, bounds = bounds, _bounds(points, *cut)
+        if np.array_equal(bounds, before):
+            return low, high, float(bounds[4])
+
+
+def _bounds(points: Points, low: Values, high: Values) -> Values:
+    out = np.array([np.inf, np.inf, -np.inf, -np.inf, np.inf])
+    raster.plan_bounds(points, low, high, out)
+    return out
+
+
+def _without_far_bins(points: Points, low: Values, high: Values) -> tuple[Values, Values] | None:
+    """Return the part of a plan box without far bins; None where there are none."""
+    size = float((high - low).max()) / _BINS
+    if size <= 0:
+        return None
+    count = np.zeros((_BINS + 1, _BINS + 1), np.int64)
+    raster.plan_count(points, low, high, size, count)
+    is_near = distance_transform_edt(count == 0) <= _FAR_BINS / 2
+    groups, number = label(is_near, structure=np.ones((3, 3)))
+    groups[count == 0] = 0
+    total = np.bincount(groups.ravel(), weights=count.ravel(), minlength=number + 1)
+    few = max(_FEW_SHARE * len(points), min(_FEW_POINTS, _FEW_SHARE_OF_SMALL * len(points)))
+    is_kept = total > few
+    is_kept[0] = False
+    if is_kept[1:].all():
+        return None
+    rows, columns = np.nonzero(is_kept[groups])
+    cut_low = low + size * np.array([columns.min(), rows.min()])
+    cut_high = low + size * np.array([columns.max() + 1, rows.max() + 1])
+    return np.maximum(low, cut_low), np.minimum(high, cut_high)

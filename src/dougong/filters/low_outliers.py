@@ -1,0 +1,212 @@
+"""Points below the ground: the guard before the cloth, which rests on the lowest points.
+
+Single stray points and small clusters (multipath under floors and water) lie below a surface that
+neighbouring cells agree on; courtyards, moats, ditches and terraces are surfaces of their own.
+"""
+
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from dougong._checks import as_points
+from dougong.errors import InputError
+from dougong.filters.extent import plan_box
+from dougong.filters.selection import Selection
+from dougong.kernels import low_outliers as kernels
+from dougong.kernels import raster
+from dougong.params import Parameters
+from dougong.threads import for_blocks
+from dougong.typing import Index, Points, Values
+
+KIND: Literal["local", "two-pass", "global"] = "two-pass"
+
+_BLOCK = 1 << 18
+_MAX_CELLS = 20_000_000
+_SMALLEST_CELL_M = 0.25
+_LARGEST_CELL_M = 16.0
+_POINTS_PER_CELL = 4
+_LINK_SLOPE = 0.5
+
+
+class LowOutliers(Parameters):
+    """What counts as a level of the ground, and what lies impossibly below it."""
+
+    min_depth_m: Annotated[float, Field(gt=0)] = 0.3
+    """Points less than this below the ground are left to the cloth's own threshold, metres."""
+    smallest_level_m2: Annotated[float, Field(gt=0)] = 4.0
+    """A connected surface of at least this plan area is real, however deep it lies. Pits that are
+    smaller and joined to nothing (a manhole seen from above) are taken for multipath."""
+    min_points: Annotated[int, Field(ge=1)] = 3
+    """A surface has at least this many points in the 3 x 3 x 3 voxels round each of its points."""
+    min_share: Annotated[float, Field(ge=0, lt=1)] = 0.02
+    """... and at least this share of the densest surface above or below it: the outliers under a
+    dense cloud are many, but never as dense as it."""
+    ground_window_m: Annotated[float, Field(gt=0)] = 20.0
+    """Canopies and roofs narrower than this are never taken for the ground, metres."""
+    cell_m: Annotated[float, Field(gt=0)] | None = None
+    """Plan size of a voxel, metres. None: the smallest of 0.25, 0.35, 0.5 ... 16 m at
+    which half of the occupied cells hold 4 points or more."""
+
+
+class _Columns(NamedTuple):
+    """The voxels of a cloud, column by column (see kernels.low_outliers)."""
+
+    keys: Index
+    """(n,) voxel of each point."""
+    unique: Index
+    """(m,) occupied voxels, ascending."""
+    counts: Index
+    """(m,) points in each."""
+    starts: Index
+    """(rows * columns + 1,) where the run of each column begins in `unique`."""
+    shape: tuple[int, int, int]
+    cell: float
+    level: float
+    bottom: float
+    """z of the lower side of level 0."""
+
+
+def halo_m(params: LowOutliers) -> float:
+    """Return the ground window: the level of the ground is looked for inside it."""
+    return params.ground_window_m
+
+
+def low_outliers(points: Points, params: LowOutliers | None = None) -> Selection:
+    """Find the points below the ground that no surface explains.
+
+    The cloud is counted in voxels. A voxel with enough points round it is part of a surface;
+    surfaces large enough are levels. The ground is the lowest level of each column, opened
+    (minimum, then maximum over `ground_window_m`) so that canopies and roofs do not count while
+    slopes and pits stay. A point of no level, `min_depth_m` or more below the ground of its own
+    and the eight columns round it, is a low outlier. Cost: one sort of the points.
+
+    Parameters
+    ----------
+    points
+        (n, 3), metres, z up, in a local frame.
+    params
+        See `LowOutliers`.
+
+    Returns
+    -------
+    Selection
+        ``is_kept`` is False for low outliers. Points far outside in plan are never low outliers.
+
+    Raises
+    ------
+    InputError
+        `points` is not (n, 3) or not finite.
+    """
+    params = params or LowOutliers()
+    points = as_points(points)
+    is_low = np.zeros(len(points), np.bool_)
+    if len(points):
+        columns = _columns(points, params)
+        is_level = _levels(columns, params)
+        floor = _ground(columns, is_level, params) - params.min_depth_m
+
+        def block(start: int, stop: int) -> None:
+            kernels.mark_low(
+                points[start:stop],
+                columns.keys[start:stop],
+                columns.unique,
+                columns.starts,
+                columns.shape[2],
+                is_level,
+                floor,
+                is_low[start:stop],
+            )
+
+        for_blocks(len(points), _BLOCK, block)
+    number = int(is_low.sum())
+    notes = (f"{number} of {len(points)} points lie below the ground",) if number else ()
+    return Selection(is_kept=~is_low, notes=notes)
+
+
+def _columns(points: Points, params: LowOutliers) -> _Columns:
+    low, high, lowest = plan_box(points)
+    cell = params.cell_m or _cell_for(points, low, high)
+    level = max(params.min_depth_m / 2, cell / 4)
+    rows, columns = _plan_shape(low, high, cell)
+    levels = int((points[:, 2].max() - lowest) / level) + 2
+    shape = (rows, columns, levels)
+    origin = np.append(low, lowest)
+    keys = np.empty(len(points), np.int64)
+
+    def block(start: int, stop: int) -> None:
+        kernels.voxel_keys(points[start:stop], origin, cell, level, shape, keys[start:stop])
+
+    for_blocks(len(points), _BLOCK, block)
+    unique, count = np.empty((2, len(points)), np.int64)
+    number = kernels.runs(np.sort(keys), unique, count)
+    unique, count = unique[:number].copy(), count[:number].copy()
+    starts = np.empty(rows * columns + 1, np.int64)
+    kernels.column_starts(unique, levels, starts)
+    return _Columns(keys, unique, count, starts, shape, cell, level, lowest)
+
+
+def _plan_shape(low: Values, high: Values, cell: float) -> tuple[int, int]:
+    columns, rows = np.floor((high - low) / cell) + 1
+    if rows * columns > _MAX_CELLS:
+        msg = (
+            f"low_outliers would need {rows * columns:.3g} cells of {cell:g} m; at most "
+            f"{_MAX_CELLS:.3g} are possible. Set cell_m to a larger value, or crop the cloud."
+        )
+        raise InputError(msg)
+    return int(rows), int(columns)
+
+
+def _cell_for(points: Points, low: Values, high: Values) -> float:
+    """Return the smallest cell at which half of the occupied ones hold 4 points or more."""
+    cell = _SMALLEST_CELL_M
+    while True:
+        columns, rows = np.floor((high - low) / cell) + 1
+        if rows * columns <= _MAX_CELLS:
+            count = np.zeros((int(rows), int(columns)), np.int64)
+            raster.plan_count(points, low, high, cell, count)
+            is_enough = float(np.median(count[count > 0])) >= _POINTS_PER_CELL
+            if is_enough or cell >= _LARGEST_CELL_M:
+                return cell
+        cell *= np.sqrt(2.0)
+
+
+def _levels(columns: _Columns, params: LowOutliers) -> NDArray[np.bool_]:
+    """Return, per voxel, whether it belongs to a surface that is large enough to be real."""
+    number = len(columns.unique)
+    support = np.empty(number, np.int64)
+
+    def block(start: int, stop: int) -> None:
+        kernels.count_support(
+            columns.unique, columns.counts, columns.starts, columns.shape, start, stop, support
+        )
+
+    for_blocks(number, _BLOCK, block)
+    is_strong = np.empty(number, np.bool_)
+    kernels.mark_strong(support, columns.starts, params.min_points, params.min_share, is_strong)
+    parent = np.empty(number, np.int64)
+    reach = 1 + int(np.ceil(_LINK_SLOPE * columns.cell / columns.level))
+    kernels.link_surfaces(columns.unique, columns.starts, is_strong, columns.shape, reach, parent)
+    smallest = int(np.ceil(params.smallest_level_m2 / columns.cell**2))
+    is_level = np.empty(number, np.bool_)
+    kernels.mark_levels(columns.unique, columns.shape[2], is_strong, parent, smallest, is_level)
+    return is_level
+
+
+def _ground(columns: _Columns, is_level: NDArray[np.bool_], params: LowOutliers) -> Values:
+    """Return the lower side of the ground per column (rows * columns,), z; NaN: unknown."""
+    rows, plan_columns, levels = columns.shape
+    lowest = np.full(rows * plan_columns, np.inf)
+    voxels = columns.unique[is_level]
+    np.minimum.at(lowest, voxels // levels, voxels % levels * columns.level + columns.bottom)
+    size = 2 * int(np.ceil(params.ground_window_m / 2 / columns.cell)) + 1
+    grid = minimum_filter(lowest.reshape(rows, plan_columns), size, mode="constant", cval=np.inf)
+    grid[np.isinf(grid)] = -np.inf
+    grid = maximum_filter(grid, size, mode="constant", cval=-np.inf)
+    grid[np.isinf(grid)] = np.inf
+    # A wall seen from the air drops inside one cell: the lower side of a step counts for both.
+    grid = minimum_filter(grid, 3, mode="constant", cval=np.inf)
+    grid[np.isinf(grid)] = np.nan
+    return np.ascontiguousarray(grid.reshape(-1))

@@ -1,0 +1,319 @@
+"""Neighbours and normals: one index over a cloud, asked as often as needed.
+
+`build_index` halves the points at medians into a balanced tree of tight boxes, so neither density
+(100 : 1 within one scan) nor a single far point costs anything. All
+answers are exact; equal distances are ranked by content (x, y, z), so no answer depends on point
+order, thread count or, since work is in local metres, on the coordinates' size.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dougong._checks import as_points
+from dougong.errors import InputError
+from dougong.kernels import boxtree, moments, neighbours, order
+from dougong.threads import for_blocks
+from dougong.typing import Index, Points, Values
+
+_LEAF = 16
+"""At most this many points in a leaf (and at least half as many)."""
+_SUBTREES = 32
+"""Parts of the tree that are built apart, on the threads."""
+_BLOCK = 32_768
+"""Queries per task: fixed, so results do not depend on the thread count."""
+
+
+class Neighbourhood(NamedTuple):
+    """An index over n points; build it with `build_index`."""
+
+    points: Points
+    """(n, 3) metres, in sorted order."""
+    order: Index
+    """(n,) place in the caller's array of each sorted point."""
+    boxes: NDArray[np.float64]
+    """(2 leaves, 6) low and high corner of every node (see `kernels.boxtree`)."""
+
+
+class Surface(NamedTuple):
+    """What the neighbourhood of each of n points looks like."""
+
+    normals: Points
+    """(n, 3) unit; upward (level ones towards +x, then +y). NaN with fewer than 2 neighbours."""
+    variation: Values
+    """(n,) surface variation l3 / (l1 + l2 + l3), 0 .. 1/3 (METHOD.md eq. 3)."""
+    planarity: Values
+    """(n,) (l2 - l3) / l1, 0 .. 1."""
+
+
+def spatial_order(points: Points) -> Index:
+    """Return the places of `points` (n, 3) along a Morton curve that refines where it must.
+
+    The curve has 2**21 cells along the longest side of the points' box. Where a far point makes
+    such a cell hold many points, those are sorted again within their own box.
+    """
+    n = len(points)
+    places = np.arange(n, dtype=np.int64)
+    if n < 2:
+        return places
+    low = points.min(axis=0)
+    edge = max(float((points.max(axis=0) - low).max()), 1e-9)
+    keys = np.empty(n, np.uint64)
+    for_blocks(
+        n,
+        1 << 18,
+        lambda start, stop: order.morton_keys(
+            points, low, edge * 2.0**-order.KEY_BITS, start, stop, keys
+        ),
+    )
+    order.radix_argsort(
+        keys, 3 * order.KEY_BITS, places, np.empty(n, np.int64), np.empty(n, np.uint64)
+    )
+    starts = np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))
+    _sort_crowded(points, places, starts)
+    return places
+
+
+def _sort_crowded(points: Points, places: Index, starts: Index) -> None:
+    """Sort again, in place, the runs of `places` that begin at `starts` and are too long."""
+    stops = np.append(starts[1:], len(places))
+    # A run as long as the whole is either one place repeated or too small to be told apart.
+    is_crowded = (stops - starts > 2 * _LEAF) & (stops - starts < len(places))
+    for first, last in zip(starts[is_crowded], stops[is_crowded], strict=True):
+        run = places[first:last]
+        inside = points[run]
+        if (inside != inside[0]).any():
+            places[first:last] = run[spatial_order(inside)]
+
+
+def build_index(points: ArrayLike) -> Neighbourhood:
+    """Return an index over `points` (n, 3) metres. O(n log n), about 45 bytes per point."""
+    ordered = as_points(points).copy()
+    n = len(ordered)
+    places = np.arange(n, dtype=np.int64)
+    leaves = 1
+    while n > leaves * _LEAF:
+        leaves *= 2
+    boxes = np.full((2 * leaves, 6), np.inf)
+    top = min(leaves, _SUBTREES)
+    if top > 1:
+        boxtree.split(ordered, places, boxes, 1, top)
+
+    def task(first: int, last: int) -> None:
+        for node in range(top + first, top + last):
+            boxtree.split(ordered, places, boxes, node, 2 * leaves)
+
+    if n:
+        for_blocks(top, 1, task)
+    return Neighbourhood(ordered, places, boxes)
+
+
+def _check_distance(value: float, name: str) -> float:
+    if not value > 0:
+        raise InputError(f"{name} must be a positive number of metres, got {value}.")
+    return float(value) ** 2
+
+
+def _visiting_order(queries: Points) -> Index:
+    """Return the order in which to answer `queries`: along the curve, so the tree stays cached."""
+    if len(queries) <= _BLOCK:
+        return np.arange(len(queries), dtype=np.int64)
+    return spatial_order(queries)
+
+
+def _back(index: Neighbourhood, places: Index) -> Index:
+    """Return places in the caller's array for `places` in sorted order; -1 stays -1."""
+    found = places >= 0
+    result = np.full(places.shape, -1, np.int64)
+    result[found] = index.order[places[found]]
+    return result
+
+
+def nearest(
+    index: Neighbourhood, queries: ArrayLike, max_distance_m: float = np.inf
+) -> tuple[Index, Values]:
+    """Return the nearest indexed point of every query.
+
+    Parameters
+    ----------
+    index : Neighbourhood
+    queries : array_like, shape (m, 3)
+        Metres, in the frame of the indexed points.
+    max_distance_m : float
+        Nothing farther is found; inclusive.
+
+    Returns
+    -------
+    index : ndarray, shape (m,)
+        Places in the array given to `build_index`; -1 where nothing is in reach.
+    distance_m : ndarray, shape (m,)
+        Inf where nothing is in reach.
+    """
+    limit2 = _check_distance(max_distance_m, "max_distance_m")
+    asked = as_points(queries, "queries")
+    sequence = _visiting_order(asked)
+    found = np.full(len(asked), -1, np.int64)
+    distance = np.full(len(asked), np.inf)
+
+    def task(start: int, stop: int) -> None:
+        rows = sequence[start:stop]
+        places = np.empty(len(rows), np.int64)
+        distance2 = np.empty(len(rows))
+        neighbours.nearest(index.points, index.boxes, asked[rows], limit2, places, distance2)
+        found[rows] = _back(index, places)
+        distance[rows] = np.sqrt(distance2)
+
+    if len(index.points):
+        for_blocks(len(asked), _BLOCK, task)
+    return found, distance
+
+
+def knn(
+    index: Neighbourhood,
+    queries: ArrayLike | None,
+    k: int,
+    max_distance_m: float = np.inf,
+) -> tuple[Index, Values]:
+    """Return the k nearest indexed points of every query, nearest first.
+
+    Parameters
+    ----------
+    index : Neighbourhood
+    queries : array_like, shape (m, 3), or None
+        None asks for the indexed points themselves, in the caller's order: each point's k nearest
+        *other* points (duplicates of it are others, at distance 0).
+    k : int
+        At least 1.
+    max_distance_m : float
+        Nothing farther is found; inclusive.
+
+    Returns
+    -------
+    index : ndarray, shape (m, k)
+        Places in the array given to `build_index`; -1 where there are fewer.
+    distance_m : ndarray, shape (m, k)
+        Inf where there are fewer.
+    """
+    limit2 = _check_distance(max_distance_m, "max_distance_m")
+    if k < 1:
+        raise InputError(f"k must be at least 1, got {k}.")
+    if queries is None:
+        return _self_knn(index, k, limit2)
+    asked = as_points(queries, "queries")
+    sequence = _visiting_order(asked)
+    found = np.full((len(asked), k), -1, np.int64)
+    distance = np.full((len(asked), k), np.inf)
+
+    def task(start: int, stop: int) -> None:
+        rows = sequence[start:stop]
+        places = np.empty((len(rows), k), np.int64)
+        distance2 = np.empty((len(rows), k))
+        neighbours.knn(index.points, index.boxes, asked[rows], limit2, places, distance2)
+        found[rows] = _back(index, places)
+        distance[rows] = np.sqrt(distance2)
+
+    if len(index.points):
+        for_blocks(len(asked), _BLOCK, task)
+    return found, distance
+
+
+def _self_knn(index: Neighbourhood, k: int, limit2: float) -> tuple[Index, Values]:
+    n = len(index.points)
+    found = np.empty((n, k), np.int64)
+    distance = np.empty((n, k))
+
+    def task(first: int, last: int) -> None:
+        start, places, distance2 = self_knn_block(index, k, limit2, first, last)
+        rows = index.order[start : start + len(places)]
+        found[rows] = _back(index, places)
+        distance[rows] = np.sqrt(distance2)
+
+    if n:
+        for_blocks(*blocks_of_leaves(index), task)
+    return found, distance
+
+
+def blocks_of_leaves(index: Neighbourhood) -> tuple[int, int]:
+    """Return (leaves, leaves per block): what `for_blocks` needs to visit the index in order."""
+    return len(index.boxes) // 2, _BLOCK // _LEAF
+
+
+def self_knn_block(
+    index: Neighbourhood, k: int, limit2: float, first_leaf: int, last_leaf: int
+) -> tuple[int, Index, Values]:
+    """Return (first sorted place, places (m, k), squared distances (m, k)) of a block of leaves.
+
+    Everything in sorted order: for passes that reduce neighbours at once, never holding n k.
+    """
+    n = len(index.points)
+    leaves = len(index.boxes) // 2
+    start, stop = first_leaf * n // leaves, last_leaf * n // leaves
+    places = np.empty((stop - start, k), np.int64)
+    distance2 = np.empty((stop - start, k))
+    neighbours.self_knn(index.points, index.boxes, limit2, first_leaf, last_leaf, places, distance2)
+    return start, places, distance2
+
+
+def count_within(index: Neighbourhood, queries: ArrayLike | None, radius_m: float) -> Index:
+    """Return how many indexed points lie within `radius_m` (inclusive) of every query (m, 3).
+
+    None asks for the indexed points themselves, in the caller's order; each counts itself.
+    """
+    radius2 = _check_distance(radius_m, "radius_m")
+    asked = index.points if queries is None else as_points(queries, "queries")
+    sequence = np.arange(len(asked)) if queries is None else _visiting_order(asked)
+    counts = np.zeros(len(asked), np.int64)
+
+    def task(start: int, stop: int) -> None:
+        rows = sequence[start:stop]
+        found = np.empty(len(rows), np.int64)
+        neighbours.count_within(index.points, index.boxes, asked[rows], radius2, found)
+        counts[index.order[rows] if queries is None else rows] = found
+
+    if len(index.points):
+        for_blocks(len(asked), _BLOCK, task)
+    return counts
+
+
+def normals(
+    points: ArrayLike | Neighbourhood, neighbours: int = 20, max_distance_m: float = np.inf
+) -> Surface:
+    """Return normal, surface variation and planarity of every point.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 3), or Neighbourhood
+        Metres. An index is used as it is; answers come in the order of the array behind it.
+    neighbours : int
+        Nearest other points that, with the point itself, make its neighbourhood; at least 2.
+    max_distance_m : float
+        Neighbours farther than this are left out; inclusive.
+
+    Returns
+    -------
+    Surface
+        From the covariance about the neighbourhood's mean. The sign of a normal says nothing about
+        the outside: it points up.
+    """
+    if neighbours < 2:
+        raise InputError(f"neighbours must be at least 2 to span a plane, got {neighbours}.")
+    limit2 = _check_distance(max_distance_m, "max_distance_m")
+    index = points if isinstance(points, Neighbourhood) else build_index(points)
+    n = len(index.points)
+    surface = Surface(np.full((n, 3), np.nan), np.full(n, np.nan), np.full(n, np.nan))
+
+    def task(first: int, last: int) -> None:
+        start, places, _ = self_knn_block(index, neighbours, limit2, first, last)
+        moments.describe_neighbours(index.points, places, start, *surface)
+
+    if n:
+        for_blocks(*blocks_of_leaves(index), task)
+    return Surface(*(_unsorted(index, values) for values in surface))
+
+
+def _unsorted(index: Neighbourhood, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return per-point `values`, given in sorted order, in the caller's order."""
+    result = np.empty_like(values)
+    result[index.order] = values
+    return result

@@ -1,0 +1,289 @@
+"""The protective rule of CWASF: points are judged by how well the surface near them holds them.
+
+docs/denoising.md has the reasoning and what it was measured on. In short: the spacing that
+scans have hereabouts is the yardstick; a neighbour's distance is divided along the surface or the
+line it lies on, never inflated; the first to eighth nearest are tested together, so that pairs do
+not vouch for each other; groups that are smaller than their distance from everything large go.
+Kernels are imported when called.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dougong.threads import for_blocks
+from dougong.typing import Index, Points, Values
+
+if TYPE_CHECKING:
+    from dougong.filters.neighbourhood import Neighbourhood
+
+NEIGHBOURS = 12
+"""Nearest points that a point's surroundings are seen by."""
+TESTS = 8
+"""The first to this many nearest are tested."""
+REACH_M = 0.5
+"""Nothing farther is a neighbour: doubled or halved to suit the cloud's median spacing."""
+SPARSE, DENSE = 5.0, 50.0
+"""Median spacings that the reach must hold, and may hold before it is halved: 0.5 m serves from
+100 to 10,000 points/m2. In a longer reach scattered noise would have a spacing of its own."""
+NEAR_CELLS, FAR_CELLS = 0.5, 1.0
+"""Cells, in reaches, in which the spacing is averaged: out to 1.5 cells round a point."""
+FEW = 50.0
+"""The far average counts like this many near points."""
+LINK = 2.0
+"""Points within this many spacings make a group: an even surface holds together from 1.2 on."""
+GROUP = 2.0
+"""A group that extends farther than this many reaches is large; a wider gap is taken as this."""
+MANY = 1000
+"""A group of so many points is large: whatever it is, it was scanned, not stirred up."""
+_STEPS = 1 << 16
+"""Steps per unit in which logarithms are summed, exactly."""
+_SMALLEST_M = 2.0**-14
+_BLOCK = 1 << 13
+
+
+class Taken(IntEnum):
+    """Why the protective rule removes a point: attribute ``removal_reason``."""
+
+    KEPT = 0
+    ALONE = 1
+    """Fewer than eight others within reach."""
+    OFF_SURFACE = 2
+    """Its nearest neighbour is too far, for the spacing here and along the surface there."""
+    IN_PAIR = 3
+    """One to seven others are near, the next is too far."""
+    SMALL_GROUP = 4
+    """It belongs to a group that is smaller than its distance from everything large."""
+
+
+class Verdict(NamedTuple):
+    """What the rule says about n points, in the caller's order."""
+
+    margin: Values
+    """(n,) above 1: removed; inf: alone."""
+    reason: NDArray[np.uint8]
+    """(n,) `Taken`."""
+    spacing_m: Values
+    """(n,) the spacing of the surface hereabouts, the yardstick."""
+    curvature: Values
+    """(n,) surface variation of the 12 nearest."""
+
+
+def halo_m(reach_m: float | None) -> float:
+    """Return how far the rule reaches: a group, its gap, another group, and their surroundings.
+
+    Infinity where the reach is taken from the cloud: find it first, with `reach_for`.
+    """
+    if reach_m is None:
+        return math.inf
+    return reach_m * (3.0 * GROUP + 3.0 + 2.0 * FAR_CELLS)
+
+
+def reach_for(points: ArrayLike) -> float:
+    """Return the reach, metres, for a cloud (n, 3): `REACH_M` where it suits."""
+    from dougong.filters.neighbourhood import build_index
+
+    return _reach_of(build_index(points))
+
+
+def _reach_of(index: Neighbourhood) -> float:
+    from dougong.filters.neighbourhood import blocks_of_leaves, self_knn_block
+
+    n = len(index.points)
+    if n <= TESTS:
+        return REACH_M
+    eighth = np.empty(n)
+
+    def task(first: int, last: int) -> None:
+        start, _, distance2 = self_knn_block(index, TESTS, np.inf, first, last)
+        eighth[start : start + len(distance2)] = np.sqrt(distance2[:, -1])
+
+    for_blocks(*blocks_of_leaves(index), task)
+    spacing = float(np.partition(eighth, n // 2)[n // 2]) * math.sqrt(math.pi / TESTS)
+    reach = REACH_M
+    while reach < SPARSE * spacing:
+        reach *= 2.0
+    while reach > 2.0 * DENSE * max(spacing, _SMALLEST_M):
+        reach /= 2.0
+    return reach
+
+
+def distance_limits(surface_loss: float) -> Values:
+    """Return how far, in spacings, the k-th nearest may be (`TESTS`,).
+
+    On a surface sampled at random the k-th nearest lies within r with pi r^2 / spacing^2
+    distributed as Gamma(k): the share `surface_loss` of such points lies beyond each limit.
+    """
+    from scipy.special import gammainccinv
+
+    limits: Values = np.sqrt(gammainccinv(np.arange(1, TESTS + 1), surface_loss) / np.pi)
+    return limits
+
+
+def judge(
+    points: ArrayLike,
+    alpha: float,
+    gamma: float,
+    surface_loss: float,
+    reach_m: float | None = None,
+) -> Verdict:
+    """Judge `points` (n, 3), metres; parameters as in `CurvatureWeighted`."""
+    from dougong.filters.neighbourhood import build_index
+    from dougong.kernels import protective as kernels
+
+    index = build_index(points)
+    reach = _reach_of(index) if reach_m is None else reach_m
+    n = len(index.points)
+    places, own = _neighbours(index, reach)
+    spacing = local_spacing(index.points, own, reach)
+    curvature, frame = np.zeros(n), np.zeros((n, 9), np.float32)
+    margin, decisive = np.empty(n), np.zeros(n, np.uint8)
+    limits = distance_limits(surface_loss)
+
+    def see(start: int, stop: int) -> None:
+        kernels.frames(index.points, places, alpha, gamma, start, stop, curvature, frame)
+
+    def test(start: int, stop: int) -> None:
+        kernels.support(index.points, places, frame, spacing, limits, start, stop, margin, decisive)
+
+    for_blocks(n, _BLOCK, see)
+    for_blocks(n, _BLOCK, test)
+    reason = np.where(decisive == 1, Taken.OFF_SURFACE, Taken.IN_PAIR).astype(np.uint8)
+    reason[~np.isfinite(margin)] = Taken.ALONE
+    lonely = _group_margin(index, places, frame, spacing, GROUP * reach)
+    is_worse = lonely > margin
+    margin[is_worse], reason[is_worse] = lonely[is_worse], Taken.SMALL_GROUP
+    reason[margin <= 1.0] = Taken.KEPT
+    back = np.empty(n, np.int64)
+    back[index.order] = np.arange(n)
+    return Verdict(margin[back], reason[back], spacing[back], curvature[back])
+
+
+def _neighbours(index: Neighbourhood, reach: float) -> tuple[NDArray[np.int32], Values]:
+    """Return the places (n, 12) of every point's nearest and the spacing (n,) they show."""
+    from dougong.filters.neighbourhood import blocks_of_leaves, self_knn_block
+
+    n = len(index.points)
+    places = np.full((n, NEIGHBOURS), -1, np.int32)
+    own = np.empty(n)
+
+    def task(first: int, last: int) -> None:
+        start, found, distance2 = self_knn_block(index, NEIGHBOURS, reach**2, first, last)
+        places[start : start + len(found)] = found
+        eighth = np.minimum(np.sqrt(distance2[:, TESTS - 1]), reach)
+        own[start : start + len(found)] = eighth * math.sqrt(math.pi / TESTS)
+
+    if n:
+        for_blocks(*blocks_of_leaves(index), task)
+    return places, own
+
+
+def local_spacing(points: Points, own_m: Values, reach_m: float) -> Values:
+    """Return the spacing (n,) usual round every point: the geometric mean over its surroundings.
+
+    A geometric mean by points: noise is few and hardly counts. Where few points are near, the
+    wider surroundings count more, so a flock of birds is not measured by itself.
+    """
+    steps = np.rint(np.log2(np.maximum(own_m, _SMALLEST_M) / _SMALLEST_M) * _STEPS)
+    near, mean_near = _smooth(points, steps.astype(np.int64), NEAR_CELLS * reach_m)
+    _, mean_far = _smooth(points, steps.astype(np.int64), FAR_CELLS * reach_m)
+    mean = (near * mean_near + FEW * mean_far) / (near + FEW)
+    spacing: Values = _SMALLEST_M * np.exp2(mean / _STEPS)
+    return spacing
+
+
+def _smooth(points: Points, steps: Index, edge: float) -> tuple[Values, Values]:
+    """Return smoothed count and mean (n,) of `steps` (n,) over cells of `edge` metres."""
+    from dougong.kernels import protective as kernels
+
+    n = len(points)
+    cells = np.floor(points / edge).astype(np.int64)
+    axes = [np.unique(cells[:, axis]) for axis in range(3)]
+    sizes = [len(axis) for axis in axes]
+    at = [np.searchsorted(axis, cells[:, k]) for k, axis in enumerate(axes)]
+    keys, cell = np.unique((at[0] * sizes[1] + at[1]) * sizes[2] + at[2], return_inverse=True)
+    around = _around(keys, axes)
+    held = np.bincount(cell, minlength=len(keys))
+    sums = np.bincount(cell, weights=steps, minlength=len(keys)).astype(np.int64)
+    count, mean = np.empty(n), np.empty(n)
+    for_blocks(
+        n,
+        _BLOCK,
+        lambda start, stop: kernels.smooth_means(
+            points, edge, cell, around, held, sums, start, stop, count, mean
+        ),
+    )
+    return count, mean
+
+
+def _around(keys: Index, axes: list[Index]) -> Index:
+    """Return the places (m, 27) in `keys` (m,) of the cells round each cell; -1 where empty."""
+    sizes = [len(axis) for axis in axes]
+    at = (keys // (sizes[1] * sizes[2]), keys // sizes[2] % sizes[1], keys % sizes[2])
+    around = np.full((len(keys), 27), -1, np.int64)
+    for k in range(27):
+        found = np.ones(len(keys), bool)
+        key = np.zeros(len(keys), np.int64)
+        for axis, by in enumerate((k // 9 - 1, k // 3 % 3 - 1, k % 3 - 1)):
+            wanted = axes[axis][at[axis]] + by
+            place = np.minimum(np.searchsorted(axes[axis], wanted), sizes[axis] - 1)
+            found &= axes[axis][place] == wanted
+            key = key * sizes[axis] + place
+        place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+        found &= keys[place] == key
+        around[found, k] = place[found]
+    return around
+
+
+def _group_margin(
+    index: Neighbourhood,
+    places: NDArray[np.int32],
+    frame: NDArray[np.float32],
+    spacing: Values,
+    limit_m: float,
+) -> Values:
+    """Return gap / size (n,) of each point's group; 0 in a large one.
+
+    The size is the longest side of the group's box, or the side of the square that its points
+    would cover at the spacing here, if that is larger.
+    """
+    from dougong.kernels import protective as kernels
+
+    points = index.points
+    n = len(points)
+    parent = np.arange(n)
+    kernels.link(points, places, frame, spacing, LINK, parent)
+    held, sums = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    extents = np.empty((n, 6))
+    steps = np.rint(spacing / _SMALLEST_M * _STEPS).astype(np.int64)
+    kernels.measure(points, steps, parent, held, sums, extents)
+    is_root = held > 0
+    longest = np.zeros(n)
+    longest[is_root] = (extents[is_root, 3:] - extents[is_root, :3]).max(axis=1)
+    chosen = ((longest > limit_m) | (held >= MANY))[parent]
+    asked = np.flatnonzero(~chosen)
+    margin = np.zeros(n)
+    if not len(asked):
+        return margin
+    nodes = np.zeros(len(index.boxes), bool)
+    kernels.flag_nodes(chosen, nodes)
+    gap2 = np.empty(len(asked))
+    for_blocks(
+        len(asked),
+        _BLOCK,
+        lambda start, stop: kernels.gaps(
+            points, index.boxes, chosen, nodes, limit_m**2, asked[start:stop], gap2[start:stop]
+        ),
+    )
+    gap = np.full(n, np.inf)
+    np.minimum.at(gap, parent[asked], np.sqrt(gap2))
+    root = parent[asked]
+    covered = sums[root] / held[root] * (_SMALLEST_M / _STEPS) * np.sqrt(held[root])
+    size = np.maximum(covered, longest[root])
+    margin[asked] = gap[root] / size
+    return margin

@@ -1,0 +1,169 @@
+"""Statistical outlier removal: points whose neighbours are farther off than is usual in the cloud.
+
+METHOD.md 1.4 (Rusu et al. 2008). Kernels are imported when called.
+"""
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field, model_validator
+
+from dougong._checks import as_points
+from dougong.filters.selection import Selection
+from dougong.filters.totals import LARGEST, Totals
+from dougong.params import Parameters
+from dougong.threads import for_blocks
+from dougong.typing import Points, Values
+
+KIND: Literal["local", "two-pass", "global"] = "two-pass"
+
+_STEP_M = 2.0**-24
+"""Mean distances are rounded to 60 nm before they are summed or meet the cut."""
+_STRAY = 1000.0
+"""A mean distance beyond this many medians is an outlier for sure and stays out of the sums."""
+
+
+class Statistical(Parameters):
+    """Remove points whose mean distance to their neighbours exceeds mu + multiplier x sigma.
+
+    mu and sigma are those of the whole cloud.
+    """
+
+    neighbours: Annotated[int, Field(ge=1)] | None = 20
+    """How many nearest neighbours are averaged. Left out when `radius_m` is given."""
+    radius_m: Annotated[float, Field(gt=0)] | None = None
+    """Average over all neighbours within this many metres instead."""
+    multiplier: Annotated[float, Field(ge=0)] = 2.0
+    """Standard deviations above the mean at which the cut lies."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _radius_replaces_the_default(cls, given: Any) -> Any:
+        if (
+            isinstance(given, dict)
+            and given.get("radius_m") is not None
+            and "neighbours" not in given
+        ):
+            return {**given, "neighbours": None}
+        return given
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> "Statistical":
+        if (self.neighbours is None) == (self.radius_m is None):
+            msg = (
+                "give neighbours or radius_m, not both or none, "
+                f"got {self.neighbours} and {self.radius_m}."
+            )
+            raise ValueError(msg)
+        return self
+
+
+def halo_m(params: Statistical) -> float:
+    """Return the radius; with a number of neighbours no distance is safe (METHOD.md 1.4)."""
+    return params.radius_m if params.radius_m is not None else float("inf")
+
+
+def mean_distances(points: ArrayLike, params: Statistical) -> Values:
+    """Return the mean distance (n,) of every point to its neighbours; inf without any.
+
+    Duplicates of a point are neighbours at distance 0. With fewer than `neighbours` other points
+    in the whole cloud, all of them are averaged.
+    """
+    xyz = as_points(points)
+    if params.radius_m is not None:
+        return _mean_within(xyz, params.radius_m)
+    assert params.neighbours is not None
+    return _mean_of_nearest(xyz, min(params.neighbours, max(1, len(xyz) - 1)))
+
+
+def _mean_of_nearest(xyz: Points, k: int) -> Values:
+    from dougong.filters.neighbourhood import blocks_of_leaves, build_index, self_knn_block
+
+    index = build_index(xyz)
+    result = np.full(len(xyz), np.inf)
+
+    def task(first: int, last: int) -> None:
+        start, _, distance2 = self_knn_block(index, k, np.inf, first, last)
+        rows = index.order[start : start + len(distance2)]
+        # Rows are sorted by distance, so the sum does not depend on the order of the points.
+        result[rows] = np.sqrt(distance2).sum(axis=1) / k
+
+    if len(xyz) > 1:
+        for_blocks(*blocks_of_leaves(index), task)
+    return result
+
+
+def _mean_within(xyz: Points, radius_m: float) -> Values:
+    from dougong.filters.neighbourhood import build_index
+    from dougong.kernels import neighbours
+
+    index = build_index(xyz)
+    counts = np.zeros(len(xyz), np.int64)
+    sums = np.zeros(len(xyz), np.int64)
+
+    def task(start: int, stop: int) -> None:
+        neighbours.sum_distances(
+            index.points,
+            index.boxes,
+            radius_m * radius_m,
+            1.0 / _STEP_M,
+            start,
+            stop,
+            counts,
+            sums,
+        )
+
+    if len(xyz):
+        for_blocks(len(xyz), 1 << 14, task)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(counts > 0, sums * _STEP_M / counts, np.inf)
+    result = np.empty(len(xyz))
+    result[index.order] = mean
+    return result
+
+
+def cut_distance(mean_m: Values, multiplier: float) -> tuple[float, int]:
+    """Return the cut mu + multiplier x sigma, metres, and how many points stayed out of the sums.
+
+    Out of the sums stay points without a neighbour, and strays at more than 1000 medians: one point
+    at 1e6 m would otherwise raise sigma so far that nothing else is ever removed.
+    """
+    steps = np.minimum(mean_m / _STEP_M, LARGEST).round()
+    counted = steps[np.isfinite(mean_m)].astype(np.int64)
+    if len(counted) == 0:
+        return 0.0, len(mean_m)
+    median = int(np.partition(counted, len(counted) // 2)[len(counted) // 2])
+    if median > 0:
+        counted = counted[counted <= _STRAY * median]
+    totals = Totals.of(counted)
+    return (totals.mean + multiplier * totals.deviation) * _STEP_M, len(mean_m) - len(counted)
+
+
+def statistical(points: ArrayLike, params: Statistical | None = None) -> Selection:
+    """Choose the points whose neighbours are about as near as usual.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 3)
+        Metres, local frame.
+    params : Statistical
+
+    Returns
+    -------
+    Selection
+        ``mean_distance_m`` (n,): inf for a point without a neighbour, which is an outlier.
+
+    Notes
+    -----
+    O(n log n). Tile class: two-pass (`Totals` add up over tiles).
+    """
+    params = params or Statistical()
+    mean_m = mean_distances(points, params)
+    cut, strays = cut_distance(mean_m, params.multiplier)
+    # Half a step above: a point exactly at the cut stays, whatever its last digit.
+    is_kept = mean_m <= cut + 0.5 * _STEP_M
+    notes = (f"{strays} points lie far from all others and do not count for the mean",)
+    return Selection(
+        is_kept=is_kept, attributes={"mean_distance_m": mean_m}, notes=notes if strays else ()
+    )

@@ -1,0 +1,277 @@
+"""Read E57: every scan with its pose applied, in blocks through libe57.
+
+pye57's own readers load whole scans as float32 intensity and refuse unknown fields, so only its
+libe57 bindings are used: any field, each in a type that holds it, a bounded block at a time.
+Source: ASTM E2807-11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dougong.cloud import BitField, Records
+from dougong.errors import FormatError
+from dougong.formats.stream import Block, opened, refuse_empty
+from dougong.formats.units import METRES, as_wkt, metre_form, units_of
+from dougong.typing import Mask, Points
+
+_CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+_SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+_INVALID = ("cartesianInvalidState", "sphericalInvalidState")
+_NAMES = {
+    "colorRed": "red", "colorGreen": "green", "colorBlue": "blue", "rowIndex": "row_index",
+    "columnIndex": "column_index", "returnIndex": "return_index", "returnCount": "return_count",
+    "timeStamp": "time_stamp", "nor:normalX": "nx", "nor:normalY": "ny", "nor:normalZ": "nz",
+}  # fmt: skip
+_NORMAL = ("nx", "ny", "nz")
+
+
+@dataclass(frozen=True)
+class E57Header:
+    """Where a cloud stands in its E57 file."""
+
+    station: int
+    rotation: NDArray[np.float64]
+    """(3, 3), scanner to file coordinates."""
+    translation: NDArray[np.float64]
+    """(3,), file units (metres)."""
+    source: Path | None = field(default=None, compare=False)
+
+
+@dataclass
+class E57Scan:
+    """One scan of an E57 file."""
+
+    path: Path
+    name: str
+    header: E57Header
+    count: int
+    fields: dict[str, str]
+    """E57 field name to dtype."""
+    crs: str | None = None
+    notes: tuple[str, ...] = ()
+    bits: dict[str, BitField] = field(default_factory=dict)
+
+    @property
+    def dtype(self) -> np.dtype[np.void]:
+        """Record layout: every field of the scan, invalid states apart."""
+        return np.dtype(
+            [(_NAMES.get(n, n), t) for n, t in self.fields.items() if n not in _INVALID]
+        )
+
+    def blocks(self, rows: int) -> Iterator[Block]:
+        """Yield the scan in blocks, pose applied."""
+        from pye57 import libe57
+
+        rows = max(1, min(rows, self.count))
+        with _image(self.path) as image:
+            buffers = libe57.VectorSourceDestBuffer()
+            arrays: dict[str, NDArray[Any]] = {}
+            for name, dtype in self.fields.items():
+                arrays[name] = np.zeros(rows, dtype=_BUFFER.get(dtype, dtype))
+                buffers.append(libe57.SourceDestBuffer(image, name, arrays[name], rows, True, True))
+            reader, done = None, 0
+            try:
+                points = image.root()["data3D"][self.header.station]["points"]
+                reader = points.reader(buffers)
+                while done < self.count:
+                    got = int(reader.read())
+                    if got == 0:
+                        raise _damaged(self.path, self.name, self.count, done)
+                    yield self._block({n: a[:got] for n, a in arrays.items()})
+                    done += got
+            except libe57.E57Exception as error:
+                raise _damaged(self.path, self.name, self.count, done) from error
+            finally:
+                if reader is not None:
+                    reader.close()
+
+    def _block(self, columns: dict[str, NDArray[Any]]) -> Block:
+        size = len(next(iter(columns.values())))
+        records: Records = np.empty(size, dtype=self.dtype)
+        is_invalid: Mask = np.zeros(size, dtype=bool)
+        for name, values in columns.items():
+            if name in _INVALID:
+                is_invalid |= _is_unusable(values)
+            else:
+                records[_NAMES.get(name, name)] = values
+        local = _cartesian(columns)
+        if not np.array_equal(self.header.rotation, np.eye(3)):
+            local = local @ self.header.rotation.T
+            if set(_NORMAL) <= set(records.dtype.names or ()):
+                normals = np.stack([records[axis] for axis in _NORMAL], axis=1)
+                for axis, turned in zip(_NORMAL, (normals @ self.header.rotation.T).T, strict=True):
+                    records[axis] = turned
+        return Block(records, local + self.header.translation, is_invalid)
+
+
+# pye57 0.4 fills 8-byte integer buffers at the wrong stride, and knows no 4-byte ones: doubles
+# hold these exactly up to 2^53.
+_BUFFER = {"u4": "f8", "i4": "f8", "i8": "f8"}
+
+
+def _is_unusable(values: NDArray[Any]) -> Mask:
+    """Return which points have no position: 1 keeps a direction only, 2 has nothing."""
+    is_unusable: Mask = values != 0
+    return is_unusable
+
+
+def _cartesian(columns: dict[str, NDArray[Any]]) -> Points:
+    if set(_CARTESIAN) <= set(columns):
+        return np.stack([columns[name].astype(np.float64) for name in _CARTESIAN], axis=1)
+    distance, azimuth, elevation = (columns[name].astype(np.float64) for name in _SPHERICAL)
+    level = distance * np.cos(elevation)
+    return np.stack(
+        [level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=1
+    )
+
+
+def _damaged(path: Path, scan: str, promised: int, found: int) -> FormatError:
+    return FormatError(
+        f"{path.name}: scan {scan!r} should hold {promised:,} points, the file is damaged or ends "
+        f"after about {found:,}. Copy it again."
+    )
+
+
+@contextmanager
+def _image(path: Path) -> Iterator[Any]:
+    from pye57 import libe57
+
+    with opened(path) as file:
+        signature = file.read(8)
+    if signature != b"ASTM-E57":
+        msg = f"{path.name} is not an E57 file: it starts with {signature!r}, expected b'ASTM-E57'."
+        raise FormatError(msg)
+    try:
+        image = libe57.ImageFile(str(path), "r")
+    except libe57.E57Exception as error:
+        reason = str(error).strip().splitlines()[0]
+        msg = f"{path.name} cannot be read as E57: {reason}. It may be truncated; copy it again."
+        raise FormatError(msg) from error
+    try:
+        yield image
+    finally:
+        image.close()
+
+
+def open_e57(path: Path) -> list[E57Scan]:
+    """Read the headers of an E57 file; one scan object for each scan that has points.
+
+    Raises
+    ------
+    FormatError
+        Not an E57 file, damaged, or without any point.
+    """
+    from pye57 import libe57
+
+    with _image(path) as image:
+        try:
+            root = image.root()
+            crs, said = _crs_of(root)
+            scans = [
+                _scan(path, root["data3D"][i], i, crs, said) for i in range(len(root["data3D"]))
+            ]
+        except libe57.E57Exception as error:
+            reason = str(error).strip().splitlines()[0]
+            raise FormatError(f"{path.name} has a damaged E57 header: {reason}.") from error
+    filled = [scan for scan in scans if scan.count]
+    refuse_empty(len(filled), path)
+    return filled
+
+
+def _crs_of(root: Any) -> tuple[str | None, tuple[str, ...]]:
+    """Return the reference system and what is to be said about it.
+
+    Coordinates and poses of an E57 file are metres whatever unit its system has (ASTM E2807-11,
+    8.4): a system in feet is taken over with its axes in metres, so that numbers and system agree.
+    """
+    if not root.isDefined("coordinateMetadata"):
+        return None, ()
+    text = str(root["coordinateMetadata"].value()).strip()
+    wkt = as_wkt(text) if text else None
+    if wkt is None:
+        return None, ("its coordinate metadata were not understood.",) if text else ()
+    units = units_of(wkt)
+    if units.unit_m == METRES:
+        return wkt, ()
+    said = (
+        f"its reference system ({units.name}) is in {units.names[0]}, but E57 coordinates are "
+        "metres by definition: taken as metres."
+    )
+    return metre_form(wkt), (said,)
+
+
+def _scan(path: Path, node: Any, index: int, crs: str | None, said: tuple[str, ...]) -> E57Scan:
+    from pye57 import libe57
+
+    points = node["points"]
+    prototype = libe57.StructureNode(points.prototype())
+    fields, left_out = {}, []
+    for k in range(prototype.childCount()):
+        name = prototype.get(k).elementName()
+        dtype = _dtype_of(prototype[name])
+        if dtype is None:
+            left_out.append(name)
+        else:
+            fields[name] = dtype
+    label = str(node["name"].value()) if node.isDefined("name") else ""
+    label = label.strip() or f"{path.stem}_{index + 1}"
+    if not (set(_CARTESIAN) <= set(fields) or set(_SPHERICAL) <= set(fields)):
+        msg = f"{path.name}: scan {label!r} has no coordinates, only {', '.join(fields)}."
+        raise FormatError(msg)
+    rotation, translation = _pose_of(node)
+    notes = (f"text fields were not read: {', '.join(left_out)}.",) if left_out else ()
+    header = E57Header(index, rotation, translation, source=path)
+    return E57Scan(path, label, header, int(points.childCount()), fields, crs, (*said, *notes))
+
+
+def _dtype_of(node: Any) -> str | None:
+    """Return the smallest dtype that holds a field exactly; None for text."""
+    from pye57 import libe57
+
+    if isinstance(node, libe57.FloatNode):
+        return "f4" if node.precision() == libe57.E57_SINGLE else "f8"
+    if isinstance(node, libe57.ScaledIntegerNode):
+        return "f8"
+    if not isinstance(node, libe57.IntegerNode):
+        return None
+    low, high = int(node.minimum()), int(node.maximum())
+    for dtype in ("u1", "u2", "u4") if low >= 0 else ("i1", "i2", "i4"):
+        if np.iinfo(dtype).min <= low and high <= np.iinfo(dtype).max:
+            return dtype
+    return "i8"
+
+
+def _pose_of(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    rotation, translation = np.eye(3), np.zeros(3)
+    if not node.isDefined("pose"):
+        return rotation, translation
+    pose = node["pose"]
+    if pose.isDefined("rotation"):
+        quaternion = [float(pose["rotation"][axis].value()) for axis in "wxyz"]
+        rotation = _matrix_of(np.array(quaternion))
+    if pose.isDefined("translation"):
+        translation = np.array([float(pose["translation"][axis].value()) for axis in "xyz"])
+    return rotation, translation
+
+
+def _matrix_of(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation of a quaternion (w, x, y, z), which need not have length one."""
+    length = float(np.linalg.norm(quaternion))
+    if length == 0:
+        return np.eye(3)
+    w, x, y, z = quaternion / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,130 @@
+"""Write a cloud as binary PLY: the vertices of a PLY file bit for bit, others converted."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dougong.cloud import Cloud, Records
+from dougong.formats.atomic import Sink
+from dougong.formats.las_fields import columns_of, coordinate_fields
+from dougong.formats.las_header import LasHeader
+from dougong.formats.ply import CRS_COMMENT, PlyHeader, has_crs
+
+_NAMES = {
+    "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint",
+    "f4": "float", "f8": "double",
+}  # fmt: skip
+_ENCODINGS = {"<": "binary_little_endian", ">": "binary_big_endian"}
+_PIECE = 1_000_000
+
+
+def ply_parts(cloud: Cloud) -> tuple[bytes, Records, list[str]]:
+    """Return header, vertices and notes that hold `cloud` as PLY."""
+    notes: list[str] = []
+    comments: list[str] = []
+    order = "<"
+    if isinstance(cloud.header, PlyHeader):
+        header = cloud.header
+        order = ">" if header.encoding == "binary_big_endian" else "<"
+        comments = list(header.comments)
+        if header.encoding == "ascii":
+            notes.append("written as binary PLY; the input was ASCII.")
+        notes += [
+            f"{number} {name} elements of the input are not written (they point at vertices)."
+            for name, number in header.elements
+            if number
+        ]
+    if isinstance(cloud.header, PlyHeader) and not cloud.is_moved:
+        records = cloud.records
+    else:
+        records = _converted(cloud, notes)
+    records = _storable(records, order, notes)
+    if not has_crs(cloud.header, cloud.frame.crs):
+        comments = [line for line in comments if not line.lower().startswith("comment crs")]
+        if cloud.frame.crs is not None:
+            comments.append(f"comment {CRS_COMMENT}{' '.join(cloud.frame.crs.split())}")
+    lines = ["ply", f"format {_ENCODINGS[order]} 1.0", *comments, f"element vertex {len(records)}"]
+    for name in records.dtype.names or ():
+        kind = records.dtype[name]
+        lines.append(f"property {_NAMES[kind.str.lstrip('<>|=')]} {name}")
+    return "\n".join([*lines, "end_header", ""]).encode(), records, notes
+
+
+def _converted(cloud: Cloud, notes: list[str]) -> Records:
+    """Return records with double x, y, z in front and every attribute unpacked behind them."""
+    coordinates = cloud.frame.to_file(cloud.xyz)
+    dropped = coordinate_fields(cloud)
+    layout: list[tuple[str, object]] = [(axis, "<f8") for axis in "xyz"]
+    columns = {n: v for n, v in columns_of(cloud).items() if n not in dropped}
+    if isinstance(cloud.header, LasHeader):
+        _shrink_colours(columns, notes)
+    for name, values in columns.items():
+        layout.append(
+            (name, values.dtype if values.ndim == 1 else (values.dtype, values.shape[1:]))
+        )
+    records = np.empty(len(cloud), dtype=np.dtype(layout))
+    for index, axis in enumerate("xyz"):
+        records[axis] = coordinates[:, index]
+    for name, values in columns.items():
+        records[name] = values
+    if not isinstance(cloud.header, PlyHeader):
+        notes.append("coordinates are written as doubles, as PLY has no scaled integers.")
+    return records
+
+
+def _shrink_colours(columns: dict[str, NDArray[Any]], notes: list[str]) -> None:
+    """Turn 16-bit colours into the 8-bit ones PLY viewers expect, where no bit is lost."""
+    colours = {n: columns[n] for n in ("red", "green", "blue") if n in columns}
+    for factor in (257, 256):
+        if colours and all(not (values % factor).any() for values in colours.values()):
+            columns |= {n: (values // factor).astype(np.uint8) for n, values in colours.items()}
+            return
+    if colours and all((values <= 255).all() for values in colours.values()):
+        columns |= {name: values.astype(np.uint8) for name, values in colours.items()}
+    elif colours:
+        notes.append("colours stay 16-bit, as they use more than 8; some viewers expect 8.")
+
+
+def _storable(records: Records, order: str, notes: list[str]) -> Records:
+    """Return records of types and names PLY has, in one byte order; as they are when they are."""
+    layout: list[tuple[str, str]] = []
+    columns = []
+    for name in records.dtype.names or ():
+        values = records[name]
+        parts = {name: values}
+        if values.ndim == 2:
+            parts = {f"{name}_{k}": values[:, k] for k in range(values.shape[1])}
+        for key, column in parts.items():
+            kind = column.dtype
+            if kind == np.bool_:
+                target = "u1"
+            elif kind.kind == "f" and kind.itemsize == 2:
+                target = "f4"
+            elif kind.kind in "iu" and kind.itemsize == 8:
+                target = "f8"
+                if len(column) and np.abs(column.astype(np.float64)).max() >= 2**53:
+                    notes.append(f"{key} has 64-bit integers, which PLY does not: rounded.")
+            elif kind.str.lstrip("<>|=") in _NAMES:
+                target = kind.str.lstrip("<>|=")
+            else:
+                notes.append(f"{key} has type {kind}, which PLY does not have: left out.")
+                continue
+            safe = "_".join(key.split()) or "field"
+            layout.append((safe, target if target in ("i1", "u1") else order + target))
+            columns.append(column)
+    dtype = np.dtype(layout)
+    if dtype == records.dtype:
+        return records
+    stored = np.empty(len(records), dtype=dtype)
+    for (name, _), column in zip(layout, columns, strict=True):
+        stored[name] = column
+    return stored
+
+
+def write_ply(sink: Sink, head: bytes, records: Records) -> int:
+    """Write a header and its vertices; return how many there are."""
+    sink.write(head)
+    for start in range(0, len(records), _PIECE):
+        sink.write(np.ascontiguousarray(records[start : start + _PIECE]).view(np.uint8).data)
+    return len(records)

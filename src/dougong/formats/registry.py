@@ -1,0 +1,246 @@
+"""Which reader and writer a file gets: by its suffix, checked against its first bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dougong.cloud import Cloud
+from dougong.errors import FormatError, InputError, OutputError
+from dougong.formats.model import Written
+from dougong.formats.stream import Scan, iterate_scans, opened, read_scans, stem_of
+
+SUFFIXES = {
+    ".las": "las", ".laz": "las", ".e57": "e57", ".ply": "ply", ".pcd": "pcd",
+    ".xyz": "text", ".pts": "text", ".csv": "text", ".txt": "text", ".asc": "text",
+}  # fmt: skip
+_SIGNATURES = ((b"LASF", "las"), (b"ASTM-E57", "e57"), (b"ply", "ply"), (b"# .PCD", "pcd"))
+_SHOWN = {"las": "LAS/LAZ", "e57": "E57", "ply": "PLY", "pcd": "PCD", "text": "text"}
+BLOCK_ROWS = 1_000_000
+WRITABLE = (".las", ".laz", ".copc.laz", ".ply")
+
+
+def kind_of(path: Path) -> str:
+    """Return "las", "e57", "ply", "pcd" or "text" for a file that can be opened.
+
+    Raises
+    ------
+    FormatError
+        Unknown suffix, a file that is not what its suffix says, missing, a folder, empty.
+    """
+    kind = SUFFIXES.get(path.suffix.lower())
+    with opened(path) as file:
+        head = file.read(16)
+    if kind is None:
+        msg = (
+            f"{path.name} has the suffix {path.suffix or 'none'!r}; point clouds that can be read "
+            f"end in {', '.join(SUFFIXES)}. Rename or export it."
+        )
+        raise FormatError(msg)
+    found = next((name for start, name in _SIGNATURES if head.startswith(start)), None)
+    if found is not None and found != kind:
+        suffix = next(suffix for suffix, name in SUFFIXES.items() if name == found)
+        msg = (
+            f"{path.name} is a {_SHOWN[found]} file by its first bytes, not {_SHOWN[kind]}. "
+            f"Rename it to {path.with_suffix(suffix).name}."
+        )
+        raise FormatError(msg)
+    return kind
+
+
+def scans_of(path: Path, kind: str) -> list[Scan]:
+    """Return the scans of a file that is not LAS."""
+    if kind == "e57":
+        from dougong.formats.e57 import open_e57
+
+        return list(open_e57(path))
+    if kind == "ply":
+        from dougong.formats.ply import open_ply
+
+        return [open_ply(path)]
+    if kind == "pcd":
+        from dougong.formats.pcd import open_pcd
+
+        return [open_pcd(path)]
+    from dougong.formats.text import open_text
+
+    return [open_text(path)]
+
+
+def read_stations(path: Path | str) -> list[Cloud]:
+    """Return one cloud per scan of an E57 file, poses applied, in one frame; else one cloud.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read, is empty or truncated; the message says which and what to do.
+    """
+    path = Path(path)
+    kind = kind_of(path)
+    if kind == "las":
+        from dougong.formats import las
+
+        return [las.read(path)]
+    scans = scans_of(path, kind)
+    if kind == "text":
+        from dougong.formats.text import TextScan
+
+        for scan in scans:
+            assert isinstance(scan, TextScan)
+            scan.load(BLOCK_ROWS)  # its column types need a pass of their own: parse only once
+    clouds = read_scans(scans, BLOCK_ROWS)
+    return [replace(clouds[0], name=stem_of(path))] if len(scans) == 1 else clouds
+
+
+def read(path: Path | str) -> Cloud:
+    """Return a whole point cloud file.
+
+    An E57 file with several scans becomes one cloud with the uint16 attribute `station`, counted
+    from 0 in the order of the file; use `read_stations` to keep them apart.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read, is empty or truncated; the message says which and what to do.
+    """
+    path = Path(path)
+    clouds = read_stations(path)
+    if len(clouds) == 1 and getattr(clouds[0].header, "station", 0) == 0:
+        return clouds[0]
+    return _merged_stations(clouds, path)
+
+
+def _merged_stations(clouds: Sequence[Cloud], path: Path) -> Cloud:
+    marked = [
+        cloud.with_attribute("station", np.full(len(cloud), cloud.header.station, dtype="<u2"))
+        for cloud in clouds
+    ]
+    layout: dict[str, Any] = {}
+    for cloud in marked:
+        for name in cloud.records.dtype.names or ():
+            kind = cloud.records.dtype[name]
+            layout[name] = np.promote_types(layout[name], kind) if name in layout else kind
+    records = np.zeros(sum(map(len, marked)), dtype=list(layout.items()))
+    xyz = np.empty((len(records), 3))
+    at = 0
+    missing: set[str] = set()
+    for cloud in marked:
+        part = slice(at, at + len(cloud))
+        xyz[part] = cloud.xyz
+        for name in layout:
+            if name in (cloud.records.dtype.names or ()):
+                records[name][part] = cloud.records[name]
+            else:
+                missing.add(name)
+        at += len(cloud)
+    notes = [f"{cloud.name}: {note}" for cloud in clouds for note in cloud.notes]
+    notes += [f"{name} is 0 for stations without it." for name in sorted(missing)]
+    return replace(clouds[0], xyz=xyz, records=records, name=stem_of(path), notes=tuple(notes))
+
+
+def iterate(path: Path | str, chunk_points: int = 1_000_000) -> Iterator[Cloud]:
+    """Yield a file in clouds of at most `chunk_points` points that share one frame.
+
+    The file is never held as a whole (PCD binary_compressed is one block by design: it is).
+    E57, PLY, PCD and text are passed over twice, LAS once. Scans of an E57 file follow one
+    another; `cloud.header.station` tells them apart.
+
+    Raises
+    ------
+    FormatError
+        As `read`; a truncated file raises where it ends.
+    """
+    if chunk_points < 1:
+        raise InputError(f"chunk_points must be at least 1, got {chunk_points}.")
+    path = Path(path)
+    kind = kind_of(path)
+    if kind == "las":
+        from dougong.formats import las
+
+        return las.iterate(path, chunk_points)
+    return iterate_scans(scans_of(path, kind), chunk_points)
+
+
+def family_of(path: Path) -> str:
+    """Return the suffix a cloud is written by, or raise OutputError naming those there are."""
+    name = path.name.lower()
+    found = next((s for s in (".copc.laz", ".laz", ".las", ".ply") if name.endswith(s)), None)
+    if found is None:
+        msg = (
+            f"{path.name} has the suffix {path.suffix or 'none'!r}; clouds are written as "
+            f"{', '.join(WRITABLE)}. Choose one of these."
+        )
+        raise OutputError(msg)
+    return found
+
+
+def write(
+    cloud: Cloud,
+    path: Path | str,
+    *,
+    overwrite: bool = False,
+    notes: Sequence[str] | None = None,
+) -> Written:
+    """Write a cloud as LAS, LAZ, COPC or PLY, chosen by suffix; all of it or nothing.
+
+    An unmoved cloud keeps its records bit for bit where the format is of the same family; a
+    moved one gets new coordinates, never at a coarser step, and keeps every other bit.
+
+    Parameters
+    ----------
+    notes : sequence of str, optional
+        Put in front of the notes returned.
+
+    Raises
+    ------
+    OutputError
+        `path` exists and `overwrite` is False, is the input itself, has an unknown suffix, the
+        disk is full, or the coordinates do not fit.
+    """
+    path = Path(path)
+    family = family_of(path)
+    from dougong.formats.atomic import refuse_bad_target, replacing
+
+    refuse_bad_target(path, overwrite=overwrite, source=getattr(cloud.header, "source", None))
+    if not len(cloud):
+        raise OutputError(f"{cloud.name} has no points left, so {path.name} was not written.")
+    if family == ".ply":
+        from dougong.formats.ply_write import ply_parts, write_ply
+
+        head, records, said = ply_parts(cloud)
+        with replacing(path, expected_bytes=len(head) + records.nbytes) as sink:
+            write_ply(sink, head, records)
+    else:
+        from dougong.formats.las_records import las_parts
+
+        header, records, said = las_parts(
+            cloud, modern=family == ".copc.laz", packed=family == ".laz"
+        )
+        write_las_parts(path, family, header, records)
+    return Written(
+        path=path,
+        points=len(records),
+        bytes=path.stat().st_size,
+        notes=(*(notes or ()), *said),
+    )
+
+
+def write_las_parts(path: Path, family: str, header: Any, records: Any) -> None:
+    """Write a LAS header and its records as `family` (".las", ".laz", ".copc.laz")."""
+    from dougong.formats.atomic import replacing
+    from dougong.formats.copc import write_copc
+    from dougong.formats.las_write import LasWriter
+
+    # Compressed points take about half; only named in the message of a full disk.
+    expected = records.nbytes if family == ".las" else records.nbytes // 2
+    with replacing(path, expected_bytes=expected + 65536) as sink:
+        if family == ".copc.laz":
+            write_copc(sink, header, records)
+            return
+        writer = LasWriter(sink, header, is_compressed=family == ".laz")
+        writer.append(records)
+        writer.close()

@@ -1,0 +1,106 @@
+"""What the columns of a text file mean: from a header line, or from the numbers themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+_SYNONYMS = {
+    "x": {"x", "east", "easting", "x_coord", "coord_x", "x[m]", "x(m)", "cartesianx", "rechtswert"},
+    "y": {"y", "north", "northing", "y_coord", "coord_y", "y[m]", "y(m)", "cartesiany", "hochwert"},
+    "z": {
+        "z", "height", "elevation", "elev", "alt", "altitude", "z_coord", "coord_z", "z[m]",
+        "z(m)", "cartesianz", "h",
+    },
+    "intensity": {"intensity", "i", "int", "reflectance", "remission"},
+    "red": {"red", "r", "rf"},
+    "green": {"green", "g", "gf"},
+    "blue": {"blue", "b", "bf"},
+    "nx": {"nx", "normal_x", "normalx"},
+    "ny": {"ny", "normal_y", "normaly"},
+    "nz": {"nz", "normal_z", "normalz"},
+    "classification": {"classification", "class", "label"},
+}  # fmt: skip
+_RGB = ("red", "green", "blue")
+_NORMAL = ("nx", "ny", "nz")
+
+
+def has_numbers(words: list[str], *, has_decimal_comma: bool) -> bool:
+    """Say whether the first three words of a line are numbers (NaN counts)."""
+    if len(words) < 3:
+        return False
+    try:
+        for word in words[:3]:
+            float(word.replace(",", ".") if has_decimal_comma else word)
+    except ValueError:
+        return False
+    return True
+
+
+def named_columns(words: tuple[str, ...]) -> tuple[str, ...]:
+    """Return attribute names from the words of a header line, each once."""
+    names: list[str] = []
+    for word in words:
+        key = word.strip().lower().removeprefix("scalar_")
+        name = next((name for name, same in _SYNONYMS.items() if key in same), None)
+        name = name if name is not None and name not in names else word.strip() or "field"
+        unique, number = name, 2
+        while unique in names:
+            unique, number = f"{name}_{number}", number + 1
+        names.append(unique)
+    return tuple(names)
+
+
+def _is_whole(columns: NDArray[np.float64], most: float) -> bool:
+    known = columns[np.isfinite(columns).all(axis=1)]
+    return bool(len(known) and ((known >= 0) & (known <= most) & (known == np.rint(known))).all())
+
+
+def _is_unit(columns: NDArray[np.float64]) -> bool:
+    known = columns[np.isfinite(columns).all(axis=1)]
+    length = np.linalg.norm(known, axis=1)
+    return bool(len(known) and (np.abs(length - 1) < 0.01).mean() > 0.95)
+
+
+def column_names(sample: NDArray[np.float64]) -> tuple[tuple[str, ...], str | None]:
+    """Return names for the columns of a headerless file, and in words what was assumed.
+
+    Parameters
+    ----------
+    sample : ndarray, shape (m, k)
+        The first rows, k >= 3.
+
+    Notes
+    -----
+    x y z come first. Then, where they fit: three whole numbers in 0..255 are red green blue,
+    three that form unit vectors a normal, a single column before a colour or alone intensity.
+    """
+    count = sample.shape[1]
+    while count > 3 and np.isnan(sample[:, count - 1]).all() and len(sample):
+        count -= 1  # an empty field behind a trailing delimiter
+    names = ["x", "y", "z"]
+    at = 3
+    while at < count:
+        three = sample[:, at : at + 3]
+        if at + 3 <= count and "red" not in names and _is_whole(three, 255):
+            names += _RGB
+            at += 3
+        elif at + 3 <= count and "nx" not in names and _is_unit(three):
+            names += _NORMAL
+            at += 3
+        elif "intensity" not in names and _is_intensity(sample, at, count):
+            names.append("intensity")
+            at += 1
+        else:
+            names.append(f"field_{at + 1}")
+            at += 1
+    if count == 3:
+        return tuple(names), None
+    return tuple(names), f"no header line: columns were taken as {' '.join(names)}."
+
+
+def _is_intensity(sample: NDArray[np.float64], at: int, count: int) -> bool:
+    """Say whether column `at` stands alone: at the end, or right before a colour or a normal."""
+    three = sample[:, at + 1 : at + 4]
+    before_three = at + 4 <= count and (_is_whole(three, 255) or _is_unit(three))
+    return at + 1 == count or before_three

@@ -1,0 +1,1 @@
+"""Compiled loops. Checked arrays in, `out` filled; nothing above this room is imported."""

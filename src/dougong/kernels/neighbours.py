@@ -1,0 +1,348 @@
+"""Exact nearest neighbours over a box tree (see `boxtree`).
+
+Equal distances are ranked by content (x, then y, then z), so no answer depends on the order in
+which the points came; only exact duplicates are told apart by their place.
+"""
+
+import numpy as np
+
+from dougong.kernels._arrays import Floats, Ints
+from dougong.kernels._jit import kernel
+from dougong.kernels.boxtree import box_distance2, box_far_distance2, comes_first
+
+_DEPTH = 64
+
+
+@kernel
+def nearest(
+    points: Floats,
+    boxes: Floats,
+    queries: Floats,
+    max_distance2: float,
+    out_place: Ints,
+    out_distance2: Floats,
+) -> None:
+    """Find the nearest sorted point of each query (m, 3), within max_distance2 inclusive.
+
+    points (n, 3), boxes (2 leaves, 6); out_place (m,) int64, -1 where none is in reach;
+    out_distance2 (m,), inf where none is.
+    """
+    n = points.shape[0]
+    leaves = boxes.shape[0] // 2
+    stack = np.empty(_DEPTH, np.int64)
+    bound = np.empty(_DEPTH, np.float64)
+    for q in range(queries.shape[0]):
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        best = max_distance2
+        place = -1
+        stack[0] = 1
+        bound[0] = box_distance2(boxes, 1, x, y, z)
+        height = 1
+        while height > 0:
+            height -= 1
+            if bound[height] > best:
+                continue
+            node = stack[height]
+            while node < leaves:
+                left = box_distance2(boxes, 2 * node, x, y, z)
+                right = box_distance2(boxes, 2 * node + 1, x, y, z)
+                near = 2 * node if left <= right else 2 * node + 1
+                far = max(left, right)
+                if far <= best:
+                    stack[height] = 4 * node + 1 - near
+                    bound[height] = far
+                    height += 1
+                if min(left, right) > best:
+                    break
+                node = near
+            if node < leaves:
+                continue
+            leaf = node - leaves
+            for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
+                dx = points[i, 0] - x
+                dy = points[i, 1] - y
+                dz = points[i, 2] - z
+                d2 = dx * dx + dy * dy + dz * dz
+                if d2 <= best and (d2 < best or place < 0 or comes_first(points, i, place)):
+                    best = d2
+                    place = i
+        out_place[q] = place
+        out_distance2[q] = best if place >= 0 else np.inf
+
+
+@kernel
+def _insert(points: Floats, places: Ints, d2s: Floats, held: int, i: int, d2: float) -> int:
+    """Put point i at squared distance d2 into the sorted lists (k,); return how many they hold."""
+    k = d2s.shape[0]
+    at = held if held < k else k - 1
+    while at > 0 and d2s[at - 1] > d2:
+        d2s[at] = d2s[at - 1]
+        places[at] = places[at - 1]
+        at -= 1
+    while at > 0 and d2s[at - 1] == d2 and comes_first(points, i, places[at - 1]):
+        d2s[at] = d2s[at - 1]
+        places[at] = places[at - 1]
+        at -= 1
+    d2s[at] = d2
+    places[at] = i
+    return held + 1 if held < k else k
+
+
+@kernel
+def _scan_leaf(
+    points: Floats,
+    leaf: int,
+    leaves: int,
+    x: float,
+    y: float,
+    z: float,
+    skip: int,
+    places: Ints,
+    d2s: Floats,
+    held: int,
+) -> int:
+    """Offer the points of a leaf, but for place `skip`, to the sorted lists of nearest ones."""
+    n = points.shape[0]
+    last = d2s.shape[0] - 1
+    worst = d2s[last]
+    for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
+        dx = points[i, 0] - x
+        dy = points[i, 1] - y
+        dz = points[i, 2] - z
+        d2 = dx * dx + dy * dy + dz * dz
+        if d2 > worst or i == skip:
+            continue
+        if d2 == worst and held > last and comes_first(points, places[last], i):
+            continue
+        held = _insert(points, places, d2s, held, i, d2)
+        worst = d2s[last]
+    return held
+
+
+@kernel
+def _descend(
+    points: Floats,
+    boxes: Floats,
+    root: int,
+    x: float,
+    y: float,
+    z: float,
+    skip: int,
+    stack: Ints,
+    bound: Floats,
+    places: Ints,
+    d2s: Floats,
+    held: int,
+) -> int:
+    """Offer every point under node `root` that may still count; nearest children first."""
+    leaves = boxes.shape[0] // 2
+    last = d2s.shape[0] - 1
+    stack[0] = root
+    bound[0] = box_distance2(boxes, root, x, y, z)
+    height = 1
+    while height > 0:
+        height -= 1
+        worst = d2s[last]
+        if bound[height] > worst:
+            continue
+        if worst == 0.0 and held > last:
+            # k copies of the query: more of them have the same coordinates. Without this a heap
+            # of n duplicates would cost n visits for each of them.
+            return held
+        node = stack[height]
+        while node < leaves:
+            left = box_distance2(boxes, 2 * node, x, y, z)
+            right = box_distance2(boxes, 2 * node + 1, x, y, z)
+            near = 2 * node if left <= right else 2 * node + 1
+            if max(left, right) <= worst:
+                stack[height] = 4 * node + 1 - near
+                bound[height] = max(left, right)
+                height += 1
+            if min(left, right) > worst:
+                break
+            node = near
+        if node >= leaves:
+            held = _scan_leaf(points, node - leaves, leaves, x, y, z, skip, places, d2s, held)
+    return held
+
+
+@kernel
+def knn(
+    points: Floats,
+    boxes: Floats,
+    queries: Floats,
+    max_distance2: float,
+    places: Ints,
+    d2s: Floats,
+) -> None:
+    """Find the k nearest sorted points of each query (m, 3), nearest first.
+
+    places (m, k) int64 and d2s (m, k) are filled; -1 and inf where fewer than k are in reach
+    (max_distance2, inclusive).
+    """
+    stack = np.empty(_DEPTH, np.int64)
+    bound = np.empty(_DEPTH, np.float64)
+    k = d2s.shape[1]
+    near = np.empty(k, np.int64)
+    near_d2 = np.empty(k, np.float64)
+    for q in range(queries.shape[0]):
+        near_d2[:] = max_distance2
+        held = _descend(
+            points,
+            boxes,
+            1,
+            queries[q, 0],
+            queries[q, 1],
+            queries[q, 2],
+            -1,
+            stack,
+            bound,
+            near,
+            near_d2,
+            0,
+        )
+        places[q, :held] = near[:held]
+        d2s[q, :held] = near_d2[:held]
+        places[q, held:] = -1
+        d2s[q, held:] = np.inf
+
+
+@kernel
+def self_knn(
+    points: Floats,
+    boxes: Floats,
+    max_distance2: float,
+    first_leaf: int,
+    last_leaf: int,
+    places: Ints,
+    d2s: Floats,
+) -> None:
+    """Find the k nearest *other* points of the sorted points in leaves first_leaf .. last_leaf - 1.
+
+    Rows follow the sorted order, from the first point of first_leaf: places and d2s (m, k).
+    Climbs from the point's own leaf, so most of the tree is never looked at.
+    """
+    n = points.shape[0]
+    leaves = boxes.shape[0] // 2
+    stack = np.empty(_DEPTH, np.int64)
+    bound = np.empty(_DEPTH, np.float64)
+    k = d2s.shape[1]
+    near = np.empty(k, np.int64)
+    near_d2 = np.empty(k, np.float64)
+    row = 0
+    for leaf in range(first_leaf, last_leaf):
+        for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            near_d2[:] = max_distance2
+            held = _scan_leaf(points, leaf, leaves, x, y, z, i, near, near_d2, 0)
+            node = leaves + leaf
+            while node > 1:
+                held = _descend(
+                    points, boxes, node ^ 1, x, y, z, i, stack, bound, near, near_d2, held
+                )
+                node >>= 1
+            places[row, :held] = near[:held]
+            d2s[row, :held] = near_d2[:held]
+            places[row, held:] = -1
+            d2s[row, held:] = np.inf
+            row += 1
+
+
+@kernel
+def count_within(points: Floats, boxes: Floats, queries: Floats, radius2: float, out: Ints) -> None:
+    """Count the sorted points within sqrt(radius2), inclusive, of each query (m, 3).
+
+    out (m,) int64. Nodes that lie wholly inside are counted without looking at their points.
+    """
+    n = points.shape[0]
+    leaves = boxes.shape[0] // 2
+    stack = np.empty(_DEPTH, np.int64)
+    for q in range(queries.shape[0]):
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
+        total = 0
+        stack[0] = 1
+        height = 1
+        while height > 0:
+            height -= 1
+            node = stack[height]
+            if box_distance2(boxes, node, x, y, z) > radius2:
+                continue
+            first, last = node, node + 1
+            while first < leaves:
+                first *= 2
+                last *= 2
+            first = (first - leaves) * n // leaves
+            last = (last - leaves) * n // leaves
+            if box_far_distance2(boxes, node, x, y, z) <= radius2:
+                total += last - first
+            elif node < leaves:
+                stack[height] = 2 * node
+                stack[height + 1] = 2 * node + 1
+                height += 2
+            else:
+                for i in range(first, last):
+                    dx = points[i, 0] - x
+                    dy = points[i, 1] - y
+                    dz = points[i, 2] - z
+                    total += dx * dx + dy * dy + dz * dz <= radius2
+        out[q] = total
+
+
+@kernel
+def sum_distances(
+    points: Floats,
+    boxes: Floats,
+    radius2: float,
+    steps_per_m: float,
+    start: int,
+    stop: int,
+    counts: Ints,
+    sums: Ints,
+) -> None:
+    """Sum the distances of sorted points start .. stop - 1 to the others within sqrt(radius2).
+
+    counts (n,) and sums (n,) are filled in sorted order; distances are summed as whole steps of
+    1 / steps_per_m metres, so the sum is exact in any order.
+    """
+    n = points.shape[0]
+    leaves = boxes.shape[0] // 2
+    stack = np.empty(_DEPTH, np.int64)
+    for q in range(start, stop):
+        x, y, z = points[q, 0], points[q, 1], points[q, 2]
+        total = 0
+        count = -1
+        stack[0] = 1
+        height = 1
+        while height > 0:
+            height -= 1
+            node = stack[height]
+            near2 = box_distance2(boxes, node, x, y, z)
+            if near2 > radius2:
+                continue
+            if boxes[node, 0] == boxes[node, 3] and (
+                boxes[node, 1] == boxes[node, 4] and boxes[node, 2] == boxes[node, 5]
+            ):
+                # A heap of duplicates counts as one: all are equally far.
+                level = 1
+                while 2 * level <= node:
+                    level *= 2
+                copies = (node - level + 1) * n // level - (node - level) * n // level
+                count += copies
+                total += copies * int(np.sqrt(near2) * steps_per_m + 0.5)
+                continue
+            if node < leaves:
+                stack[height] = 2 * node
+                stack[height + 1] = 2 * node + 1
+                height += 2
+                continue
+            leaf = node - leaves
+            for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
+                dx = points[i, 0] - x
+                dy = points[i, 1] - y
+                dz = points[i, 2] - z
+                d2 = dx * dx + dy * dy + dz * dz
+                if d2 <= radius2:
+                    count += 1
+                    total += int(np.sqrt(d2) * steps_per_m + 0.5)
+        counts[q] = count
+        sums[q] = total

@@ -1,0 +1,279 @@
+"""How well every point is held by its neighbours: the kernels of the protective rule.
+
+Points come in the order of a box tree; a frame (9,) of a point holds its normal, its long axis,
+and how much its neighbourhood excuses gaps across, along, and along as a line (see `frames`).
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dougong.kernels._arrays import Floats, Ints
+from dougong.kernels._jit import kernel
+from dougong.kernels.boxtree import box_distance2
+from dougong.kernels.moments import eigen3
+
+Small = NDArray[np.int32]
+Singles = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+
+@kernel
+def _covariance(points: Floats, places: Small, i: int, a: Floats) -> int:
+    """Fill a (3, 3) with the covariance of point i and its neighbours; return how many they are."""
+    held = 1
+    mean = np.zeros(3, np.float64)
+    a[:, :] = 0.0
+    for column in range(places.shape[1]):
+        j = places[i, column]
+        if j < 0:
+            break
+        held += 1
+        for r in range(3):
+            dr = points[j, r] - points[i, r]
+            mean[r] += dr
+            for c in range(r, 3):
+                a[r, c] += dr * (points[j, c] - points[i, c])
+    for r in range(3):
+        for c in range(r, 3):
+            a[r, c] = a[r, c] / held - mean[r] / held * (mean[c] / held)
+            a[c, r] = a[r, c]
+    return held
+
+
+@kernel
+def frames(
+    points: Floats,
+    places: Small,
+    alpha: float,
+    gamma: float,
+    start: int,
+    stop: int,
+    variation: Floats,
+    out: Singles,
+) -> None:
+    """Fill variation (n,) and out (n, 9) for sorted points start .. stop - 1 from their places.
+
+    out: unit normal, unit long axis, then the divisors (at least 1) of distances along the middle
+    axis, along the long axis, and along the long axis where links are made (lines only).
+    places (n, k) int32, -1 where missing.
+    """
+    a = np.empty((3, 3), np.float64)
+    v = np.empty((3, 3), np.float64)
+    for i in range(start, stop):
+        held = _covariance(points, places, i, a)
+        variation[i] = 0.0
+        out[i, :6] = 0.0
+        out[i, 6:] = 1.0
+        if held < 4:
+            continue
+        small, middle, large = eigen3(a, v)
+        least, next_least = max(a[small, small], 0.0), max(a[middle, middle], 0.0)
+        total = least + next_least + max(a[large, large], 0.0)
+        if total <= 0.0:
+            continue
+        variation[i] = least / total
+        flat = 1.0 - math.tanh(gamma * least / total)
+        line = 1.0 - math.tanh(gamma * (least + next_least) / total)
+        for axis in range(3):
+            out[i, axis] = v[axis, small]
+            out[i, 3 + axis] = v[axis, large]
+        out[i, 6] = 1.0 + alpha * flat * (1.0 - line)
+        out[i, 7] = 1.0 + alpha * max(flat, line)
+        out[i, 8] = 1.0 + alpha * line
+
+
+@kernel
+def _parts2(points: Floats, frame: Singles, i: int, j: int) -> tuple[float, float, float]:
+    """Return squared parts of p_i - p_j along the normal, the middle and the long axis of j."""
+    dx = points[i, 0] - points[j, 0]
+    dy = points[i, 1] - points[j, 1]
+    dz = points[i, 2] - points[j, 2]
+    whole = dx * dx + dy * dy + dz * dz
+    up = dx * frame[j, 0] + dy * frame[j, 1] + dz * frame[j, 2]
+    along = dx * frame[j, 3] + dy * frame[j, 4] + dz * frame[j, 5]
+    return up * up, max(whole - up * up - along * along, 0.0), along * along
+
+
+@kernel
+def support(
+    points: Floats,
+    places: Small,
+    frame: Singles,
+    spacing: Floats,
+    limits: Floats,
+    start: int,
+    stop: int,
+    margin: Floats,
+    decisive: Bytes,
+) -> None:
+    """Fill margin (n,) and decisive (n,) for sorted points start .. stop - 1.
+
+    margin: the largest over k of (k-th least protected distance) / limits[k - 1], distances being
+    divided by the spacing (n,) round the neighbour; above 1 is too far. decisive: that k.
+    """
+    tests = limits.shape[0]
+    best = np.empty(tests, np.float64)
+    for i in range(start, stop):
+        best[:] = np.inf
+        for column in range(places.shape[1]):
+            j = places[i, column]
+            if j < 0:
+                break
+            up, across, along = _parts2(points, frame, i, j)
+            d2 = up + across / (frame[j, 6] * frame[j, 6]) + along / (frame[j, 7] * frame[j, 7])
+            d2 /= spacing[j] * spacing[j]
+            if d2 >= best[tests - 1]:
+                continue
+            at = tests - 1
+            while at > 0 and best[at - 1] > d2:
+                best[at] = best[at - 1]
+                at -= 1
+            best[at] = d2
+        margin[i] = -1.0
+        for k in range(tests):
+            ratio = math.sqrt(best[k]) / limits[k]
+            if ratio > margin[i]:
+                margin[i] = ratio
+                decisive[i] = k + 1
+
+
+@kernel
+def _root(parent: Ints, i: int) -> int:
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+@kernel
+def link(
+    points: Floats, places: Small, frame: Singles, spacing: Floats, reach: float, parent: Ints
+) -> None:
+    """Join, in parent (n,), points that are neighbours within `reach` spacings of each other.
+
+    Along a line the distance is divided as its frame says. parent comes as 0 .. n - 1 and leaves
+    with the root of every point's group.
+    """
+    n = points.shape[0]
+    for i in range(n):
+        for column in range(places.shape[1]):
+            j = places[i, column]
+            if j < 0:
+                break
+            up, across, along = _parts2(points, frame, i, j)
+            far = reach * max(spacing[i], spacing[j])
+            if up + across + along / (frame[j, 8] * frame[j, 8]) <= far * far:
+                a, b = _root(parent, i), _root(parent, j)
+                if a != b:
+                    parent[max(a, b)] = min(a, b)
+    for i in range(n):
+        parent[i] = _root(parent, i)
+
+
+@kernel
+def measure(
+    points: Floats, steps: Ints, parent: Ints, held: Ints, sums: Ints, boxes: Floats
+) -> None:
+    """Fill, at every root: held (n,) points, sums (n,) of their steps (n,), boxes (n, 6)."""
+    n = points.shape[0]
+    boxes[:, :3] = np.inf
+    boxes[:, 3:] = -np.inf
+    for i in range(n):
+        root = parent[i]
+        held[root] += 1
+        sums[root] += steps[i]
+        for axis in range(3):
+            boxes[root, axis] = min(boxes[root, axis], points[i, axis])
+            boxes[root, 3 + axis] = max(boxes[root, 3 + axis], points[i, axis])
+
+
+@kernel
+def flag_nodes(chosen: NDArray[np.bool_], nodes: NDArray[np.bool_]) -> None:
+    """Fill nodes (2 leaves,): whether any point under the node is chosen (n,)."""
+    n = chosen.shape[0]
+    leaves = nodes.shape[0] // 2
+    for leaf in range(leaves):
+        nodes[leaves + leaf] = chosen[leaf * n // leaves : (leaf + 1) * n // leaves].any()
+    for node in range(leaves - 1, 0, -1):
+        nodes[node] = nodes[2 * node] or nodes[2 * node + 1]
+
+
+@kernel
+def gaps(
+    points: Floats,
+    boxes: Floats,
+    chosen: NDArray[np.bool_],
+    nodes: NDArray[np.bool_],
+    limit2: float,
+    asked: Ints,
+    out: Floats,
+) -> None:
+    """Fill out (m,): squared distance from asked points to the nearest chosen; limit2 if none."""
+    n = points.shape[0]
+    leaves = boxes.shape[0] // 2
+    stack = np.empty(64, np.int64)
+    for q in range(asked.shape[0]):
+        i = asked[q]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        best = limit2
+        stack[0] = 1
+        height = 1
+        while height > 0:
+            height -= 1
+            node = stack[height]
+            if not nodes[node] or box_distance2(boxes, node, x, y, z) >= best:
+                continue
+            if node < leaves:
+                left = box_distance2(boxes, 2 * node, x, y, z)
+                right = box_distance2(boxes, 2 * node + 1, x, y, z)
+                far = 2 * node if left > right else 2 * node + 1
+                stack[height] = far
+                stack[height + 1] = 4 * node + 1 - far
+                height += 2
+                continue
+            leaf = node - leaves
+            for j in range(leaf * n // leaves, (leaf + 1) * n // leaves):
+                if chosen[j]:
+                    dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
+                    best = min(best, dx * dx + dy * dy + dz * dz)
+        out[q] = best
+
+
+@kernel
+def smooth_means(
+    points: Floats,
+    edge: float,
+    cell: Ints,
+    around: Ints,
+    held: Ints,
+    sums: Ints,
+    start: int,
+    stop: int,
+    count: Floats,
+    mean: Floats,
+) -> None:
+    """Fill count (n,) and mean (n,) of the values in the cells round points start .. stop - 1.
+
+    cell (n,) of each point; around (cells, 27) the cells round each, x slowest, -1 where empty;
+    held and sums (cells,). Weights are those of a quadratic B-spline, so nothing jumps from cell
+    to cell; count is scaled so that the middle cell of an even cloud counts fully.
+    """
+    w = np.empty((3, 3), np.float64)
+    for i in range(start, stop):
+        for axis in range(3):
+            t = points[i, axis] / edge
+            t -= np.floor(t) + 0.5
+            w[axis, 0] = 0.5 * (0.5 - t) * (0.5 - t)
+            w[axis, 1] = 0.75 - t * t
+            w[axis, 2] = 0.5 * (0.5 + t) * (0.5 + t)
+        total = weight = 0.0
+        for k in range(27):
+            other = around[cell[i], k]
+            if other >= 0:
+                here = w[0, k // 9] * w[1, (k // 3) % 3] * w[2, k % 3]
+                weight += here * held[other]
+                total += here * sums[other]
+        count[i] = 8.0 * weight
+        mean[i] = total / weight

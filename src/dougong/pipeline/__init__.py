@@ -1,0 +1,1 @@
+"""The main job: filter, register, merge, with provenance."""

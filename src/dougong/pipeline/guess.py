@@ -1,0 +1,145 @@
+"""``dougong init``: which clouds are here, which sensor made each, and a project file for them."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from dougong.errors import DougongError, InputError
+from dougong.formats import FileInfo, describe
+from dougong.pipeline.project import stem
+from dougong.typing import Kind
+
+SUFFIXES = (".las", ".laz", ".e57", ".ply", ".pcd", ".xyz", ".pts", ".ptx", ".csv", ".txt")
+_COLOURS = {"red", "green", "blue"}
+# A scanner's own frame starts at the first station; a map's easting and northing do not.
+_MAP_COORDINATE_M = 20_000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Guess:
+    """A cloud that was found, and which sensor seems to have made it."""
+
+    name: str
+    file: Path
+    kind: Kind
+    why: str
+    stations: int
+    points: int
+
+
+def guess_kind(info: FileInfo) -> tuple[Kind, str]:
+    """Return the sensor that a file's contents speak for, and why in words."""
+    names = {name.lower() for name in info.attributes}
+    has_colour = names >= _COLOURS
+    low = info.extent_min or (0.0, 0.0, 0.0)
+    is_map = info.crs_wkt is not None or max(abs(low[0]), abs(low[1])) > _MAP_COORDINATE_M
+    if info.format.upper() == "E57" or info.stations > 1:
+        return "lidar", f"{info.stations} scan(s) in an E57 file"
+    if names & {"station", "scan_angle", "return_number"} and not has_colour:
+        return "lidar", "scanner attributes and no colour"
+    if has_colour and is_map:
+        return "photogrammetry", "colour and map coordinates"
+    if has_colour and "intensity" not in names:
+        return "photogrammetry", "colour and no intensity"
+    if not has_colour:
+        return "lidar", "no colour"
+    return "lidar", "colour and intensity in the scanner's own coordinates"
+
+
+def find_clouds(folder: Path) -> tuple[list[Guess], list[str]]:
+    """Return the clouds in `folder` (and below), and what could not be read.
+
+    Raises
+    ------
+    InputError
+        There is no such folder, or no cloud in it.
+    """
+    if not folder.is_dir():
+        msg = f"{folder} is no folder. Name the folder that holds the clouds."
+        raise InputError(msg)
+    files = sorted(
+        path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()
+    )
+    guesses: list[Guess] = []
+    skipped: list[str] = []
+    for file in files:
+        try:
+            info = describe(file)
+        except DougongError as error:
+            skipped.append(f"{file.relative_to(folder)}: {error}")
+            continue
+        kind, why = guess_kind(info)
+        name = _free_name(stem(file).replace("\\", "-"), (guess.name for guess in guesses))
+        guesses.append(
+            Guess(
+                name=name,
+                file=file.relative_to(folder),
+                kind=kind,
+                why=why,
+                stations=info.stations,
+                points=info.points,
+            )
+        )
+    if not guesses:
+        msg = f"{folder} holds no readable cloud ({', '.join(SUFFIXES)}). {' '.join(skipped)}"
+        raise InputError(msg.strip())
+    return guesses, skipped
+
+
+def _free_name(name: str, taken: Iterable[str]) -> str:
+    used, number, free = set(taken), 2, name
+    while free in used:
+        free, number = f"{name}-{number}", number + 1
+    return free
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def project_text(title: str, guesses: list[Guess], skipped: list[str]) -> str:
+    """Return the commented project file."""
+    drones = [guess.name for guess in guesses if guess.kind == "photogrammetry"]
+    reference = drones[0] if drones else guesses[0].name
+    lines = [
+        "# A dougong project. Run it with: dougong run project.toml --out result",
+        "# The kinds below were guessed from the files; correct them where they are wrong.",
+        "",
+        "[project]",
+        f"name = {_quoted(title)}",
+        f"reference = {_quoted(reference)}   # the cloud whose coordinates the result has",
+    ]
+    for guess in guesses:
+        lines += [
+            "",
+            "[[cloud]]",
+            f"name = {_quoted(guess.name)}",
+            f'kind = "{guess.kind}"   # guessed: {guess.why}',
+            f"files = [{_quoted(guess.file.as_posix())}]   # {guess.points:,} points; * works",
+        ]
+        if guess.stations > 1:
+            lines.append(
+                "registered = true   # false: each of the "
+                f"{guess.stations} stations is registered by itself"
+            )
+    lines += [f"# skipped {text}" for text in skipped]
+    return "\n".join([*lines, *_SETTINGS]) + "\n"
+
+
+_SETTINGS = (
+    "",
+    "# Settings below show the defaults; take the # away to change one.",
+    "[filter.lidar.octree_voxel_grid]",
+    "# voxel_m = 0.005   # edge of a voxel; in each, one original point is kept",
+    "",
+    "[filter.lidar.cloth_simulation]",
+    "# class_threshold_m = 0.09   # H: nearer to the cloth than this is ground",
+    "",
+    "[filter.photogrammetry.cloth_simulation]",
+    "# class_threshold_m = 0.15   # the drone's noise is larger, so its H is",
+    "",
+    "[register]",
+    '# coarse = "auto"           # auto, plan, improved-pca, pca, sac-ia, 4pcs, none',
+    '# fine = "point-to-plane"   # or point-to-point, none',
+    '# dof = "auto"              # auto, 4 (levelled), 6 (rigid)',
+)

@@ -1,0 +1,304 @@
+"""The jobs on single files: filter one, move one, register one onto another."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from dougong.cloud import Cloud, Frame
+from dougong.errors import InputError
+from dougong.filters.selection import Reason
+from dougong.formats import WRITABLE, describe, faults_of, is_same_crs, read, write
+from dougong.params import Parameters
+from dougong.pipeline.guess import guess_kind
+from dougong.pipeline.marking import GROUND_CLASS, marked, with_classes
+from dougong.pipeline.memory import refuse_too_large
+from dougong.pipeline.outputs import refuse_existing, watched, write_json
+from dougong.pipeline.progress import Progress
+from dougong.pipeline.project import stem
+from dougong.pipeline.provenance import Clock, peak_memory_bytes, sha256, software
+from dougong.pipeline.recipes import LidarRecipe, PhotogrammetryRecipe, Recipe, filter_cloud
+from dougong.pipeline.registering import register
+from dougong.pipeline.registrations import finite, read_registration, to_document
+from dougong.pipeline.settings import parse_overrides, updated, validated
+from dougong.pipeline.single import filter_name, filter_single, single_fields, single_parameters
+from dougong.pipeline.steps import Filtered
+from dougong.registration import Register
+from dougong.typing import Kind
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilterJob:
+    """A sensor's recipe, or one filter alone."""
+
+    kind: Kind | None
+    only: str | None
+    params: Parameters
+
+    def run(self, cloud: Cloud, progress: Progress) -> Filtered:
+        """Filter `cloud`."""
+        if self.only is not None:
+            return filter_single(cloud, self.only, self.params, progress)
+        assert self.kind is not None
+        recipe = Recipe().model_copy(update={self.kind: self.params})
+        return filter_cloud(cloud, self.kind, recipe, progress)
+
+
+def filter_job(kind: Kind | None, only: str | None, settings: Sequence[str]) -> FilterJob:
+    """Return what ``dougong filter`` was asked for.
+
+    Raises
+    ------
+    InputError
+        Neither a kind nor a filter is named, or a setting is wrong.
+    """
+    if only is not None:
+        name = filter_name(only)
+        values = parse_overrides(settings, {name: single_fields(name)})
+        return FilterJob(kind=kind, only=name, params=single_parameters(name, values.get(name, {})))
+    if kind is None:
+        msg = (
+            "--kind is missing: say which sensor made the cloud, --kind lidar or "
+            "--kind photogrammetry, or name one filter with --only."
+        )
+        raise InputError(msg)
+    recipe: LidarRecipe | PhotogrammetryRecipe = getattr(Recipe(), kind)
+    fields = {name: list(type(getattr(recipe, name)).model_fields) for name in _filters_of(recipe)}
+    changes = {
+        name: updated(getattr(recipe, name), values, name)
+        for name, values in parse_overrides(settings, fields).items()
+    }
+    return FilterJob(kind=kind, only=None, params=recipe.model_copy(update=changes))
+
+
+def _filters_of(recipe: Parameters) -> list[str]:
+    return list(type(recipe).model_fields)
+
+
+def refuse_output(input: Path, output: Path, files: Sequence[Path], overwrite: bool) -> None:
+    """Refuse an output that could not be written, before any work is done.
+
+    Raises
+    ------
+    InputError
+        It is the input, one of `files` exists already, the folder is missing, or the suffix is
+        not one that is written.
+    """
+    if output.exists() and input.exists() and output.samefile(input):
+        msg = f"{output} is the input itself; inputs are never overwritten. Name another output."
+        raise InputError(msg)
+    if output.is_dir():
+        msg = f"{output} is a folder. Name a file in it."
+        raise InputError(msg)
+    refuse_existing(files, overwrite)
+    if not output.name.lower().endswith(WRITABLE):
+        msg = f"{output.name} cannot be written: clouds are written as {', '.join(WRITABLE)}."
+        raise InputError(msg)
+    if not output.parent.is_dir():
+        msg = f"{output.parent} is not a folder, so {output.name} cannot be written. Make it first."
+        raise InputError(msg)
+
+
+def filter_file(
+    input: Path,
+    output: Path,
+    *,
+    job: FilterJob,
+    mark: bool,
+    overwrite: bool,
+    memory_bytes: int | None,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Filter one file into another and write its books beside it (``OUTPUT.json``).
+
+    Raises
+    ------
+    InputError
+        An output exists, or the job needs more memory than it may use.
+    FormatError, OutputError
+        The input cannot be read, the output not written (a full disk).
+    """
+    books = output.with_name(output.name + ".json")
+    refuse_output(input, output, [output, books], overwrite)
+    refuse_too_large([input], memory_bytes)
+    clock = Clock()
+    progress.stage(f"reading {input.name}")
+    with clock.measure("read"):
+        digest = sha256(input)
+        cloud = read(input)
+        faults = faults_of(cloud)
+    with clock.measure("filter"):
+        filtered = job.run(cloud, progress)
+    result = _chosen(job, cloud, filtered, mark)
+    progress.stage(f"writing {output.name}")
+    with watched(output, books):
+        with clock.measure("write"):
+            written = write(result, output, overwrite=overwrite)
+        document: dict[str, Any] = {
+            "input": {"path": str(input), "sha256": digest, "points": len(cloud)},
+            "output": str(output),
+            "kind": job.kind,
+            "only": job.only,
+            "is_marked": mark,
+            "points_in": len(cloud),
+            "points_kept": len(filtered.cloud),
+            "points_written": len(result),
+            "reduction": 1.0 - len(filtered.cloud) / len(cloud),
+            "stages": [
+                {
+                    "name": stage.name,
+                    "points_in": stage.points_in,
+                    "points_out": stage.points_out,
+                    "reduction": stage.reduction,
+                    "seconds": stage.seconds,
+                }
+                for stage in filtered.stages
+            ],
+            "reasons": reason_table(filtered),
+            "ground_points": int(filtered.is_ground.sum()),
+            "parameters": job.params.model_dump(mode="json"),
+            "notes": [*cloud.notes, *faults, *filtered.notes, *written.notes],
+            "seconds": {**clock.seconds, "total": clock.total()},
+            "peak_memory_bytes": peak_memory_bytes(),
+            "software": software(),
+        }
+        document = finite(document)
+        write_json(books, document)
+    return document
+
+
+def reason_table(filtered: Filtered) -> dict[str, dict[str, int]]:
+    """Return per reason its code in ``dougong_reason`` and the points it took."""
+    return {
+        reason.name.lower(): {"code": int(reason), "points": int((filtered.codes == reason).sum())}
+        for reason in Reason
+        if (filtered.codes == reason).any()
+    }
+
+
+def _chosen(job: FilterJob, cloud: Cloud, filtered: Filtered, mark: bool) -> Cloud:
+    """Return what is written: the kept points, or all points with their marks."""
+    if mark:
+        return marked(cloud, filtered.codes, filtered.ground_class)
+    if job.only == "cloth_simulation" and getattr(job.params, "keep", "") == "all":
+        # Alone, the cloth takes nothing out: its answer is the class.
+        return with_classes(filtered.cloud, [(filtered.is_ground, GROUND_CLASS)])
+    return filtered.cloud
+
+
+def transform_file(
+    input: Path,
+    output: Path,
+    matrix: Path,
+    *,
+    accept_best: bool,
+    overwrite: bool,
+    memory_bytes: int | None,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Move one file by a registration.
+
+    Raises
+    ------
+    InputError
+        The registration is not sure and `accept_best` is False, or the output exists.
+    RegistrationError
+        The registration failed: there is no pose.
+    """
+    known = read_registration(matrix, accept_best=accept_best)
+    refuse_output(input, output, [output], overwrite)
+    refuse_too_large([input], memory_bytes)
+    progress.stage(f"reading {input.name}")
+    cloud = read(input)
+    notes = list(cloud.notes)
+    if known.target_crs is not None and is_same_crs(cloud.frame.crs, known.target_crs):
+        notes.append(
+            f"{input.name} is in {known.target}'s coordinate system already; check that it is "
+            "not moved twice"
+        )
+    if known.status != "ok":
+        notes.append(f"the pose is the best of several ({known.status}): {known.reason}")
+    moved = cloud.moved(known.matrix)
+    frame = replace(moved.frame, crs=known.target_crs)
+    if known.target_unit_m != frame.unit_m:
+        frame = Frame(crs=known.target_crs, unit_m=known.target_unit_m, step=cloud.frame.step)
+        moved = cloud.moved(known.matrix, frame)
+    else:
+        moved = replace(moved, frame=frame)
+    progress.stage(f"writing {output.name}")
+    with watched(output):
+        written = write(moved, output, overwrite=overwrite)
+    return finite_document(
+        {
+            "input": str(input),
+            "output": str(output),
+            "points": len(moved),
+            "status": known.status,
+            "matrix": known.matrix,
+            "source": known.source,
+            "target": known.target,
+            "notes": [*notes, *written.notes],
+        }
+    )
+
+
+def finite_document(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a document as JSON can hold it."""
+    cleaned: dict[str, Any] = finite(document)
+    return cleaned
+
+
+def register_files(
+    source: Path,
+    target: Path,
+    out: Path,
+    *,
+    options: Mapping[str, Any],
+    source_kind: Kind | None,
+    target_kind: Kind | None,
+    memory_bytes: int | None,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Register one file onto another; write ``registration.json`` into the folder `out`.
+
+    Raises
+    ------
+    InputError
+        A setting is wrong, or the job needs more memory than it may use.
+    FormatError, FrameError, RegistrationError
+        The clouds cannot be read or combined.
+    """
+    params = validated(Register, options, "register")
+    refuse_too_large([source, target], memory_bytes)
+    clouds: list[Cloud] = []
+    kinds: list[Kind] = []
+    inputs = []
+    notes = []
+    for path, kind in ((source, source_kind), (target, target_kind)):
+        progress.stage(f"reading {path.name}")
+        cloud = read(path)
+        clouds.append(replace(cloud, name=stem(path)))
+        if kind is None:
+            kind, why = guess_kind(describe(path))
+            notes.append(f"{path.name} is taken for {kind} ({why})")
+        kinds.append(kind)
+        inputs.append({"path": str(path), "sha256": sha256(path), "points": len(cloud)})
+        notes += [f"{path.name}: {note}" for note in (*cloud.notes, *faults_of(cloud))]
+    progress.stage(f"registering {source.name} onto {target.name}")
+    result = register(clouds[0], clouds[1], params, source_kind=kinds[0], target_kind=kinds[1])
+    document = to_document(
+        replace(result, notes=(*notes, *result.notes)),
+        source=clouds[0].name,
+        target=clouds[1].name,
+        target_frame=clouds[1].frame,
+        inputs=inputs,
+    )
+    document |= {
+        "kinds": {"source": kinds[0], "target": kinds[1]},
+        "peak_memory_bytes": peak_memory_bytes(),
+        "finished_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "software": software(),
+    }
+    write_json(out / "registration.json", document)
+    return document

@@ -1,0 +1,164 @@
+"""Results appear whole or not at all: files and folders are made beside and then renamed."""
+
+import glob
+import json
+import os
+import platform
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from dougong.errors import InputError, OutputError
+from dougong.formats import part_of
+
+_unfinished: set[Path] = set()
+
+
+def remove_unfinished() -> None:
+    """Remove what was being written. Called when the process is about to end at once."""
+    for path in list(_unfinished):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def refuse_existing(paths: Sequence[Path], overwrite: bool) -> None:
+    """Refuse to go on when a result exists already.
+
+    Raises
+    ------
+    InputError
+        One of `paths` exists and `overwrite` is False.
+    """
+    found = [path for path in paths if path.exists()]
+    if found and not overwrite:
+        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+        msg = f"{found[0]} exists already{more}. Choose another name or pass --overwrite."
+        raise InputError(msg)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file so that it is there whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        The disk is full or the folder cannot be written.
+    """
+    part = part_of(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        # The first error is the one to tell, not that of cleaning up after it.
+        with suppress(OSError):
+            part.unlink()
+        msg = f"{path} could not be written: {error.strerror or error}."
+        raise OutputError(msg) from error
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write one JSON document; NaN and infinity are refused, since JSON has neither."""
+    write_text(path, json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+@contextmanager
+def watched(*paths: Path) -> Iterator[None]:
+    """Have the unfinished forms of `paths` removed should the block be cancelled."""
+    parts = [part_of(path) for path in paths]
+    _unfinished.update(parts)
+    try:
+        yield
+    finally:
+        _unfinished.difference_update(parts)
+
+
+def _is_another_running(process: int) -> bool:
+    """Say whether another process of this machine has this number (asked on POSIX only)."""
+    if process == os.getpid():
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+def _refuse_second_writer(out: Path) -> None:
+    """Refuse a folder that another process writes to; clear what a killed one left.
+
+    Raises
+    ------
+    OutputError
+        Another process is at it, or may be (on another machine).
+    """
+    if os.name != "posix":  # there, asking whether a process lives would end it
+        return
+    head = f".{out.name}.part-"
+    for old in out.parent.glob(glob.escape(head) + "*"):
+        host, _, process = old.name.removeprefix(head).rpartition("-")
+        is_ours = host == platform.node() and process.isdigit()
+        # Our own number from an earlier life (containers count from 1 each time) is stale too.
+        if is_ours and old not in _unfinished and not _is_another_running(int(process)):
+            shutil.rmtree(old, ignore_errors=True)
+            continue
+        msg = (
+            f"{out} is being written by another dougong (process {process} on {host or 'a host'}). "
+            f"Wait for it or choose another --out; if it is gone, delete {old}."
+        )
+        raise OutputError(msg)
+
+
+@contextmanager
+def result_folder(out: Path) -> Iterator[Path]:
+    """Yield an empty folder beside `out`; its files move into `out` when the block succeeds.
+
+    Files in `out` that the job does not write stay as they are. On any failure the folder is
+    removed and `out` is untouched.
+
+    Raises
+    ------
+    OutputError
+        The folder cannot be made, or another process is writing to `out`.
+    """
+    part = out.with_name(f".{out.name}.part-{platform.node()}-{os.getpid()}")
+    if out.exists() and not out.is_dir():
+        msg = f"{out} is a file, and the result is a folder. Choose another --out."
+        raise OutputError(msg)
+    _refuse_second_writer(out)
+    try:
+        part.mkdir(parents=True)
+    except OSError as error:
+        msg = f"{out} cannot be made: {error.strerror or error}. Choose another --out."
+        raise OutputError(msg) from error
+    _unfinished.add(part)
+    try:
+        yield part
+        _move_into(part, out)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+        _unfinished.discard(part)
+
+
+def _move_into(part: Path, out: Path) -> None:
+    """Move a finished folder into place: by one rename where `out` is not there yet."""
+    try:
+        if not out.exists():
+            part.rename(out)
+            return
+        for file in sorted(path for path in part.rglob("*") if path.is_file()):
+            target = out / file.relative_to(part)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            file.replace(target)
+    except OSError as error:
+        msg = f"{out} could not be written: {error.strerror or error}."
+        raise OutputError(msg) from error

@@ -1,0 +1,186 @@
+"""The project file: what a surveyor writes down, read strictly."""
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import ConfigDict, Field, field_validator, model_validator
+
+from dougong.errors import InputError
+from dougong.params import Parameters
+from dougong.pipeline.recipes import Recipe
+from dougong.pipeline.settings import suggestion, validated
+from dougong.registration import Register
+from dougong.typing import Kind
+
+
+class Head(Parameters):
+    """The table ``[project]``."""
+
+    name: str = "dougong project"
+    """Title of the report."""
+    reference: str | None = None
+    """Cloud in whose frame the result is; default: the first photogrammetry cloud, else lidar."""
+
+
+class Entry(Parameters):
+    """One ``[[cloud]]``."""
+
+    name: Annotated[str, Field(min_length=1, pattern=r"^[^/\\\x00]+$")]
+    kind: Kind
+    files: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Paths or patterns, relative to the project file."""
+    registered: bool = True
+    """False: each station (E57) or file moves by itself."""
+    scale_known: bool = True
+    """False: the cloud's unit is not known to be the metre; then its scale is searched too."""
+
+
+class Quality(Parameters):
+    """The table ``[quality]``."""
+
+    control: str | None = None
+    """CSV of control and check points, relative to the project file."""
+    required_level: Literal["LOA10", "LOA20", "LOA30", "LOA40", "LOA50"] | None = None
+    """USIBD level of accuracy the result must reach."""
+
+
+class Project(Parameters):
+    """A whole project."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    project: Head = Head()
+    cloud: Annotated[tuple[Entry, ...], Field(min_length=1)]
+    filter: Recipe = Recipe()
+    registration: Annotated[Register, Field(alias="register")] = Register()
+    quality: Quality = Quality()
+
+    @field_validator("cloud")
+    @classmethod
+    def _names_differ(cls, clouds: tuple[Entry, ...]) -> tuple[Entry, ...]:
+        names = [entry.name for entry in clouds]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            msg = f"two clouds are called {twice[0]!r}; every cloud needs a name of its own"
+            raise ValueError(msg)
+        return clouds
+
+    @model_validator(mode="after")
+    def _reference_exists(self) -> "Project":
+        names = [entry.name for entry in self.cloud]
+        wanted = self.project.reference
+        if wanted is not None and wanted not in names:
+            msg = (
+                f"project.reference names {wanted!r}, which is no cloud"
+                f"{suggestion(wanted, names)} Clouds: {', '.join(names)}"
+            )
+            raise ValueError(msg)
+        return self
+
+    def reference(self) -> str:
+        """Return the name of the cloud in whose frame the result is."""
+        if self.project.reference is not None:
+            return self.project.reference
+        drones = [entry.name for entry in self.cloud if entry.kind == "photogrammetry"]
+        return drones[0] if drones else self.cloud[0].name
+
+
+def read_project(path: Path) -> Project:
+    """Read a project file.
+
+    Raises
+    ------
+    InputError
+        It is missing, no TOML, has an unknown or wrong key, or asks for what this version
+        cannot do.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        msg = f"there is no project file {path}. `dougong init DIR` writes one."
+        raise InputError(msg) from None
+    except IsADirectoryError:
+        msg = f"{path} is a folder. Name the project file in it."
+        raise InputError(msg) from None
+    except UnicodeDecodeError as error:
+        msg = f"{path} is no text file (byte {error.start}). Save the project file as UTF-8."
+        raise InputError(msg) from None
+    except tomllib.TOMLDecodeError as error:
+        msg = f"{path} is no valid TOML: {error}. Compare it with the output of `dougong init`."
+        raise InputError(msg) from None
+    project = validated(Project, values, str(path))
+    if project.quality.control is not None:
+        msg = (
+            f"{path}: quality.control is set, but this version does not use control points. "
+            "Remove the key; the result then states no grade of accuracy."
+        )
+        raise InputError(msg)
+    unscaled = [entry.name for entry in project.cloud if not entry.scale_known]
+    if unscaled:
+        msg = (
+            f"{path}: cloud {unscaled[0]!r} has scale_known = false, but this version does not "
+            "search the scale. Scale the cloud to metres first and remove the key."
+        )
+        raise InputError(msg)
+    if project.quality.required_level is not None:
+        msg = (
+            f"{path}: quality.required_level is set, but a level of accuracy needs independent "
+            "check points, which this version does not use. Remove the key."
+        )
+        raise InputError(msg)
+    return project
+
+
+def files_of(entry: Entry, folder: Path) -> list[Path]:
+    """Return the files of a cloud, patterns expanded, each once, sorted within a pattern.
+
+    Raises
+    ------
+    InputError
+        A path or pattern finds no file.
+    """
+    found: list[Path] = []
+    for text in entry.files:
+        path = Path(text)
+        base, pattern = (
+            (Path(path.anchor), str(path.relative_to(path.anchor)))
+            if (path.is_absolute())
+            else (folder, text)
+        )
+        exact = base / pattern
+        matches = [exact] if exact.is_file() else sorted(base.glob(pattern))
+        matches = [match for match in matches if match.is_file()]
+        if not matches:
+            msg = (
+                f"cloud {entry.name!r}: no file matches {text!r} in {base}. "
+                "Paths are relative to the project file."
+            )
+            raise InputError(msg)
+        found += [match for match in matches if match not in found]
+    return found
+
+
+def from_files(lidar: Sequence[Path], photogrammetry: Sequence[Path]) -> Project:
+    """Return the project of ``dougong run --lidar A --photogrammetry B``.
+
+    Raises
+    ------
+    InputError
+        No cloud is named, or two have the same file stem.
+    """
+    kinds: list[tuple[Kind, Path]] = [("lidar", path) for path in lidar]
+    kinds += [("photogrammetry", path) for path in photogrammetry]
+    if not kinds:
+        msg = "no cloud is named. Pass a project file, or --lidar FILE and --photogrammetry FILE."
+        raise InputError(msg)
+    clouds = [
+        {"name": stem(path), "kind": kind, "files": [str(path.resolve())]} for kind, path in kinds
+    ]
+    return validated(Project, {"cloud": clouds}, "the clouds named on the command line")
+
+
+def stem(path: Path) -> str:
+    """Return a cloud's name: the file's stem, ``.copc`` taken off too."""
+    return path.stem.removesuffix(".copc")

@@ -1,0 +1,84 @@
+"""Where a result comes from: input hashes, versions, seconds, peak memory."""
+
+import hashlib
+import platform
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import dougong
+from dougong.formats.stream import opened
+from dougong.kernels import _jit
+
+_LIBRARIES = ("numpy", "scipy", "numba", "lazrs", "pye57", "opencv-python-headless")
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a cloud's file, read in blocks of 4 MiB.
+
+    Raises
+    ------
+    FormatError
+        It is missing, a folder, empty, or may not be read.
+    """
+    digest = hashlib.sha256()
+    with opened(path) as file:
+        while block := file.read(1 << 22):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def software() -> dict[str, Any]:
+    """Return our version and those of the libraries that could change a number."""
+    found = {}
+    for name in _LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "unknown"
+    return {
+        "dougong": dougong.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "libraries": found,
+    }
+
+
+def peak_memory_bytes() -> int | None:
+    """Return the largest resident memory of this process so far; None where it is not told."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(peak if sys.platform == "darwin" else peak * 1024)
+
+
+def kernels_are_compiled() -> bool:
+    """Say whether an earlier run of this version left its compiled kernels."""
+    return _jit.is_warm()
+
+
+class Clock:
+    """Seconds per named stage, summed where a name comes back."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._start = time.perf_counter()
+
+    @contextmanager
+    def measure(self, name: str) -> Iterator[None]:
+        """Add the seconds of the ``with`` block to `name`."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+    def total(self) -> float:
+        """Return the seconds since the clock was made."""
+        return time.perf_counter() - self._start

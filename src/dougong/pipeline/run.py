@@ -1,0 +1,266 @@
+"""The main job: read, filter, register every cloud onto the reference, merge, write."""
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dougong.cloud import Cloud
+from dougong.filters.selection import Reason
+from dougong.formats import write, write_merged
+from dougong.pipeline.loading import Loader, Mover
+from dougong.pipeline.outputs import write_json
+from dougong.pipeline.progress import Progress
+from dougong.pipeline.project import Project
+from dougong.pipeline.provenance import Clock, peak_memory_bytes, software
+from dougong.pipeline.registering import register
+from dougong.pipeline.registrations import finite, to_document
+from dougong.pipeline.store import Store
+from dougong.registration import Register
+from dougong.registration.result import Registration
+
+MERGED = "merged.copc.laz"
+_WORST = ("failed", "ambiguous", "ok")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Linked:
+    """A mover and how it got into the reference's frame (None: it is the reference)."""
+
+    mover: Mover
+    result: Registration | None
+    accepts_best: bool = False
+    """The user takes the best pose of an ambiguous registration."""
+
+    @property
+    def is_sure(self) -> bool:
+        """True: its points belong into the merged cloud."""
+        if self.result is None or self.result.status == "ok":
+            return True
+        return self.accepts_best and self.result.matrix is not None
+
+    def in_reference(self, reference: Cloud) -> list[Cloud]:
+        """Return its clouds in the reference's frame; where that is not known, in their own."""
+        if self.result is None or not self.is_sure or self.result.matrix is None:
+            return self.mover.clouds
+        matrix, frame = self.result.matrix, reference.frame
+        return [cloud.moved(matrix, frame) for cloud in self.mover.clouds]
+
+
+def run(
+    project: Project,
+    folder: Path,
+    out: Path,
+    *,
+    store: Store,
+    progress: Progress,
+    shown: Callable[[Path], str] = str,
+) -> dict[str, Any]:
+    """Run a whole project and write its files into the empty folder `out`.
+
+    Parameters
+    ----------
+    project : Project
+    folder : Path
+        What the project's paths are relative to.
+    out : Path
+        Gets merged.copc.laz, clouds/, registrations/ and result.json.
+    store : Store
+        Keeps finished filter steps.
+    progress : Progress
+    shown : callable
+        How a path is named in the results.
+
+    Returns
+    -------
+    dict
+        The document of result.json.
+    """
+    clock = Clock()
+    loader = Loader(
+        folder=folder,
+        recipe=project.filter,
+        store=store,
+        progress=progress,
+        clock=clock,
+        shown=shown,
+        inputs={},
+    )
+    movers = [mover for entry in project.cloud for mover in loader.movers(entry)]
+    reference = next(mover for mover in movers if mover.entry == project.reference())
+    with clock.measure("register"):
+        linked = _register_all(movers, reference, project.registration, progress)
+    documents = _registration_documents(linked, reference, loader)
+    with clock.measure("write"):
+        merged = _write_clouds(linked, reference, out, progress)
+    for document in documents:
+        write_json(out / "registrations" / f"{document['source']}.json", document)
+    statuses = [document["status"] for document in documents] or ["ok"]
+    result: dict[str, Any] = {
+        "status": min(statuses, key=_WORST.index),
+        "is_settled": all(link.is_sure for link in linked),
+        "project": project.project.name,
+        "reference": reference.name,
+        "clouds": [_cloud_document(link, loader) for link in linked],
+        "registrations": documents,
+        "merged": merged,
+        "seconds": {**clock.seconds, "total": clock.total()},
+        "peak_memory_bytes": peak_memory_bytes(),
+        "finished_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "result_hash": _result_hash(linked, reference),
+        "software": software(),
+        "parameters": _parameters(project, shown),
+        "inputs": list(loader.inputs.values()),
+        "notes": _notes(linked),
+    }
+    result = finite(result)
+    write_json(out / "result.json", result)
+    return result
+
+
+def _parameters(project: Project, shown: Callable[[Path], str]) -> dict[str, Any]:
+    """Return the project as data, its files named as everywhere in the results."""
+    document: dict[str, Any] = project.model_dump(mode="json", by_alias=True)
+    for entry in document["cloud"]:
+        entry["files"] = [shown(Path(file)) for file in entry["files"]]
+    return document
+
+
+def _register_all(
+    movers: Sequence[Mover], reference: Mover, params: Register, progress: Progress
+) -> list[Linked]:
+    target = reference.joined()
+    params = params.model_copy(update={"filtered": True})
+    linked = []
+    for mover in movers:
+        if mover is reference:
+            linked.append(Linked(mover=mover, result=None))
+            continue
+        progress.stage(f"registering {mover.name} onto {reference.name}")
+        result = register(
+            mover.joined(),
+            target,
+            params,
+            source_kind=mover.kind,
+            target_kind=reference.kind,
+        )
+        progress.note(f"{mover.name} -> {reference.name}: {result.status}. {result.reason}")
+        linked.append(Linked(mover=mover, result=result, accepts_best=params.accept_best))
+    return linked
+
+
+def _registration_documents(
+    linked: Sequence[Linked], reference: Mover, loader: Loader
+) -> list[dict[str, Any]]:
+    return [
+        to_document(
+            link.result,
+            source=link.mover.name,
+            target=reference.name,
+            target_frame=reference.clouds[0].frame,
+            inputs=[
+                loader.inputs[source.file] for source in (*link.mover.sources, *reference.sources)
+            ],
+        )
+        for link in linked
+        if link.result is not None
+    ]
+
+
+def _write_clouds(
+    linked: Sequence[Linked], reference: Mover, out: Path, progress: Progress
+) -> dict[str, Any]:
+    """Write each filtered cloud and the merged one; return what the merged one holds."""
+    (out / "clouds").mkdir()
+    frame_of = reference.clouds[0]
+    sure: list[Cloud] = []
+    ids: list[int] = []
+    for source_id, link in enumerate(linked, 1):
+        progress.stage(f"writing clouds/{link.mover.name}.laz")
+        clouds = link.in_reference(frame_of)
+        path = out / "clouds" / f"{link.mover.name}.laz"
+        if len(clouds) == 1:
+            write(clouds[0], path)
+        else:
+            write_merged(clouds, path, source_ids=[source_id] * len(clouds))
+        if link.is_sure:
+            sure += clouds
+            ids += [source_id] * len(clouds)
+    progress.stage(f"writing {MERGED}")
+    write_merged(sure, out / MERGED, source_ids=ids)
+    names = {source_id: link.mover.name for source_id, link in enumerate(linked, 1)}
+    return {
+        "file": MERGED,
+        "points": sum(len(cloud) for cloud in sure),
+        "clouds": [names[source_id] for source_id in dict.fromkeys(ids)],
+        "source_ids": {names[source_id]: source_id for source_id in dict.fromkeys(ids)},
+    }
+
+
+def _cloud_document(link: Linked, loader: Loader) -> dict[str, Any]:
+    mover = link.mover
+    return {
+        "name": mover.name,
+        "kind": mover.kind,
+        "files": [loader.shown(source.file) for source in mover.sources],
+        "frame": "of the reference" if link.is_sure else "its own, as it is not registered",
+        "points_in": mover.points_in,
+        "points_out": mover.points_out,
+        "reduction": 1.0 - mover.points_out / mover.points_in,
+        "stages": stage_documents(mover),
+        "reasons": reason_counts([source.filtered.codes for source in mover.sources]),
+        "ground_points": int(sum(source.filtered.is_ground.sum() for source in mover.sources)),
+    }
+
+
+def stage_documents(mover: Mover) -> list[dict[str, Any]]:
+    """Return the stages of a mover, summed over its files."""
+    rows: dict[str, dict[str, Any]] = {}
+    for source in mover.sources:
+        for stage in source.filtered.stages:
+            row = rows.setdefault(
+                stage.name, {"name": stage.name, "points_in": 0, "points_out": 0, "seconds": 0.0}
+            )
+            row["points_in"] += stage.points_in
+            row["points_out"] += stage.points_out
+            row["seconds"] += stage.seconds
+    for row in rows.values():
+        row["reduction"] = 1.0 - row["points_out"] / row["points_in"] if row["points_in"] else 0.0
+    return list(rows.values())
+
+
+def reason_counts(codes: Sequence[np.typing.NDArray[np.uint8]]) -> dict[str, int]:
+    """Return how many points each reason took (and how many were kept)."""
+    counts: Counter[int] = Counter()
+    for array in codes:
+        counts.update(dict(enumerate(np.bincount(array, minlength=len(Reason)).tolist())))
+    return {reason.name.lower(): counts[reason] for reason in Reason if counts[reason]}
+
+
+def _result_hash(linked: Sequence[Linked], reference: Mover) -> str:
+    """Return the SHA-256 of kept records and local matrices: no time, path or header in it."""
+    digest = hashlib.sha256()
+    target = reference.joined().frame
+    for link in linked:
+        for cloud in link.mover.clouds:
+            records = np.ascontiguousarray(cloud.records)
+            digest.update(np.sort(records.view(f"V{records.dtype.itemsize}")).tobytes())
+        if link.result is not None and link.result.matrix is not None:
+            to_file = link.mover.joined().frame.T_file_local()
+            local = np.linalg.inv(target.T_file_local()) @ link.result.matrix @ to_file
+            # Adding zero turns -0.0 into 0.0, which has other bytes.
+            digest.update((np.round(local, 9) + 0.0).tobytes())
+    return digest.hexdigest()
+
+
+def _notes(linked: Sequence[Linked]) -> list[str]:
+    notes = [note for link in linked for source in link.mover.sources for note in source.notes]
+    for link in linked:
+        if link.result is not None:
+            notes += [f"{link.mover.name}: {note}" for note in link.result.notes]
+    return list(dict.fromkeys(notes))

@@ -1,0 +1,210 @@
+"""Filters applied in turn to one cloud, with a book of what each took and why."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dougong.cloud import Cloud
+from dougong.errors import InputError
+from dougong.filters.cloth_simulation import ClothSimulation, cloth_simulation
+from dougong.filters.curvature_weighted import CurvatureWeighted, curvature_weighted
+from dougong.filters.low_outliers import LowOutliers, low_outliers
+from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid
+from dougong.filters.pass_through import PassThrough, pass_through
+from dougong.filters.radius import Radius, radius
+from dougong.filters.selection import Reason, Selection
+from dougong.filters.statistical import Statistical, statistical
+from dougong.pipeline.progress import Progress
+from dougong.typing import Index, Mask, Values
+
+UNKNOWN, NOT_GROUND, GROUND = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageCount:
+    """What one filter did."""
+
+    name: str
+    points_in: int
+    points_out: int
+    seconds: float
+
+    @property
+    def reduction(self) -> float:
+        """Data reduction rate: 1 - points out / points in (0 when nothing came in)."""
+        return 1.0 - self.points_out / self.points_in if self.points_in else 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Filtered:
+    """A filtered cloud and why each point is in it or not."""
+
+    cloud: Cloud
+    """The kept points: the input's own records, selected."""
+    codes: NDArray[np.uint8]
+    """(n,) `Reason` of every input point."""
+    ground_class: NDArray[np.uint8]
+    """(n,) of every input point: 0 unknown, 1 not ground, 2 ground (by the cloth)."""
+    stages: tuple[StageCount, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def is_ground(self) -> Mask:
+        """(k,) over the kept points: True on the ground."""
+        ground: Mask = self.ground_class[self.codes == Reason.KEPT] == GROUND
+        return ground
+
+
+@dataclass(slots=True)
+class Bench:
+    """The work piece: which points are left, and why the others went."""
+
+    cloud: Cloud
+    progress: Progress
+    codes: NDArray[np.uint8] = field(init=False)
+    ground_class: NDArray[np.uint8] = field(init=False)
+    height_above_ground: Values | None = None
+    voxel_count: NDArray[np.int32] | None = None
+    stages: list[StageCount] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.codes = np.zeros(len(self.cloud), dtype=np.uint8)
+        self.ground_class = np.zeros(len(self.cloud), dtype=np.uint8)
+
+    def left(self) -> Index:
+        """Return the positions of the points still kept, in input order."""
+        return np.flatnonzero(self.codes == Reason.KEPT)
+
+    def apply(
+        self,
+        name: str,
+        reason: Reason,
+        verb: Callable[[Index], Selection],
+        among: Index | None = None,
+    ) -> Selection:
+        """Run one filter on the points left (or on those `among` them) and book what it took."""
+        self.progress.stage(f"{self.cloud.name}: {name.replace('_', ' ')}")
+        start = time.perf_counter()
+        left = self.left()
+        asked = left if among is None else among
+        selection = verb(asked)
+        self.codes[asked[~selection.is_kept]] = reason
+        taken = int(np.count_nonzero(~selection.is_kept))
+        self.stages.append(
+            StageCount(
+                name=name,
+                points_in=len(left),
+                points_out=len(left) - taken,
+                seconds=time.perf_counter() - start,
+            )
+        )
+        self.notes += [f"{self.cloud.name}, {name}: {note}" for note in selection.notes]
+        return selection
+
+    def result(self) -> Filtered:
+        """Close the books.
+
+        Raises
+        ------
+        InputError
+            No point is left.
+        """
+        left = self.left()
+        if len(left) == 0:
+            msg = (
+                f"{self.cloud.name}: the filters kept none of {len(self.cloud)} points. "
+                "Look at the stage that took them all and loosen it: "
+                + ", ".join(f"{stage.name} {stage.points_out}" for stage in self.stages)
+                + "."
+            )
+            raise InputError(msg)
+        return Filtered(
+            cloud=self.cloud.select(left),
+            codes=self.codes,
+            ground_class=self.ground_class,
+            stages=tuple(self.stages),
+            notes=tuple(self.notes),
+        )
+
+
+def run_octree_voxel_grid(bench: Bench, params: OctreeVoxelGrid) -> None:
+    """Decimate; remember how many points each kept one stands for."""
+    cloud = bench.cloud
+    left = bench.left()
+    chosen = bench.apply(
+        "octree_voxel_grid",
+        Reason.DECIMATED,
+        lambda index: octree_voxel_grid(cloud.xyz[index], params, records=cloud.records[index]),
+    )
+    bench.voxel_count = np.zeros(len(cloud), dtype=np.int32)
+    bench.voxel_count[left] = chosen.attributes["voxel_count"]
+
+
+def run_low_outliers(bench: Bench, params: LowOutliers) -> None:
+    """Take out what lies below the ground, so that it cannot hold the cloth up."""
+    bench.apply(
+        "low_outliers",
+        Reason.LOW_OUTLIER,
+        lambda index: low_outliers(bench.cloud.xyz[index], params),
+    )
+
+
+def run_cloth(bench: Bench, params: ClothSimulation) -> None:
+    """Tell ground from the rest; remember heights above it."""
+    left = bench.left()
+    found = bench.apply(
+        "cloth_simulation",
+        Reason.CLOTH,
+        lambda index: cloth_simulation(bench.cloud.xyz[index], params),
+    )
+    bench.ground_class[left] = found.attributes["ground_class"]
+    bench.height_above_ground = np.full(len(bench.cloud), np.nan)
+    bench.height_above_ground[left] = found.attributes["height_above_ground"]
+
+
+def run_curvature_weighted(
+    bench: Bench, params: CurvatureWeighted, among: Index | None = None
+) -> None:
+    """Take out isolated points while edges and brackets stay (CWASF)."""
+    counts = bench.voxel_count
+    bench.apply(
+        "curvature_weighted",
+        Reason.CURVATURE_WEIGHTED,
+        lambda index: curvature_weighted(
+            bench.cloud.xyz[index], params, voxel_count=None if counts is None else counts[index]
+        ),
+        among,
+    )
+
+
+def run_statistical(bench: Bench, params: Statistical) -> None:
+    """Take out points far from their neighbours, by a statistic of the whole cloud (SOR)."""
+    bench.apply(
+        "statistical",
+        Reason.STATISTICAL,
+        lambda index: statistical(bench.cloud.xyz[index], params),
+    )
+
+
+def run_radius(bench: Bench, params: Radius) -> None:
+    """Take out points with too few neighbours in a ball (ROR)."""
+    bench.apply("radius", Reason.RADIUS, lambda index: radius(bench.cloud.xyz[index], params))
+
+
+def run_pass_through(bench: Bench, params: PassThrough) -> None:
+    """Crop by axis range, box, polygon (all in the file's coordinates, metres) and height."""
+    heights = bench.height_above_ground
+    local = params.shifted(bench.cloud.frame.origin)
+    bench.apply(
+        "pass_through",
+        Reason.PASS_THROUGH,
+        lambda index: pass_through(
+            bench.cloud.xyz[index],
+            local,
+            height_above_ground=None if heights is None else heights[index],
+        ),
+    )

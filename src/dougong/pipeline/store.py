@@ -1,0 +1,88 @@
+"""Finished filter steps on disk, so that a cancelled run goes on where it was.
+
+A step is known by the hash of its input file, its parameters and our version; a changed
+registration setting therefore does not filter again, and a changed filter setting does.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+import dougong
+from dougong.cloud import Cloud
+from dougong.errors import OutputError
+from dougong.params import Parameters
+from dougong.pipeline.outputs import write_text
+from dougong.pipeline.steps import Filtered, StageCount
+from dougong.typing import Kind
+
+
+class Store:
+    """A folder of finished steps."""
+
+    def __init__(self, folder: Path, *, is_temporary: bool) -> None:
+        self.folder = folder
+        self.is_temporary = is_temporary
+
+    def key(self, digest: str, station: int, kind: Kind, params: Parameters) -> str:
+        """Return the name of a step: a hash of everything its result depends on."""
+        facts = [dougong.__version__, digest, station, kind, params.model_dump(mode="json")]
+        return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:32]
+
+    def load(self, key: str, cloud: Cloud) -> Filtered | None:
+        """Return the finished step on `cloud`, or None."""
+        books = self.folder / f"{key}.json"
+        arrays = self.folder / f"{key}.npz"
+        # The books are written last: where they are, the arrays are whole.
+        if not books.is_file() or not arrays.is_file():
+            return None
+        told = json.loads(books.read_text(encoding="utf-8"))
+        with np.load(arrays) as stored:
+            codes, ground = stored["codes"], stored["ground_class"]
+        if len(codes) != len(cloud):
+            return None
+        return Filtered(
+            cloud=cloud.select(np.flatnonzero(codes == 0)),
+            codes=codes,
+            ground_class=ground,
+            stages=tuple(StageCount(**stage) for stage in told["stages"]),
+            notes=tuple(told["notes"]),
+        )
+
+    def save(self, key: str, filtered: Filtered) -> None:
+        """Keep a finished step.
+
+        Raises
+        ------
+        OutputError
+            The disk is full or the folder cannot be written.
+        """
+        part = self.folder / f"{key}.part-{os.getpid()}.npz"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            np.savez(part, codes=filtered.codes, ground_class=filtered.ground_class)
+            part.replace(self.folder / f"{key}.npz")
+        except OSError as error:
+            with suppress(OSError):
+                part.unlink()
+            msg = (
+                f"{self.folder} could not be written: {error.strerror or error}. "
+                "Free some space or pass another --work."
+            )
+            raise OutputError(msg) from error
+        books = {
+            "stages": [asdict(stage) for stage in filtered.stages],
+            "notes": list(filtered.notes),
+        }
+        write_text(self.folder / f"{key}.json", json.dumps(books))
+
+    def finish(self) -> None:
+        """Forget everything once the run is done, unless the user named the folder."""
+        if self.is_temporary:
+            shutil.rmtree(self.folder, ignore_errors=True)

@@ -1,0 +1,169 @@
+"""How well a fit fixes its pose: block jackknife, and the directions nothing holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dougong.registration.icp_solve import FREE, normal_equations, solve
+from dougong.registration.overlap import Pairs
+from dougong.typing import Index, Points, Values
+
+_BLOCK_GROWTH = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
+_LEAST_BLOCKS = 14
+# A surface holds a motion when it faces it by more than this (sine of 17 degrees): less is
+# what scattered normals and slightly bent planes show along any direction.
+_FACING = 0.3
+# Share of the weight that must face a motion, and in how many blocks, for it to be held.
+_LEAST_FACING_SHARE = 0.004
+_LEAST_FACING_BLOCKS = 3
+_LOOSE_SIGMA_M = 0.05
+
+
+def blocks_of(points: Points, size_m: float) -> tuple[Index, int]:
+    """Return the block (n,) each point lies in, numbered in space, and how many there are."""
+    cell = np.floor(points / size_m).astype(np.int64)
+    cell -= cell.min(axis=0)
+    size = cell.max(axis=0) + 1
+    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+    keys, block = np.unique(key, return_inverse=True)
+    return block.reshape(-1).astype(np.int64), len(keys)
+
+
+def jackknife(
+    pairs: Pairs,
+    weights: Values,
+    centre: NDArray[np.float64],
+    dof: int,
+    length_m: float,
+    block_m: float,
+) -> NDArray[np.float64] | None:
+    """Return the (6, 6) covariance of (omega, v) about `centre` by leaving blocks out.
+
+    Errors of neighbouring points, and of a bending cloud, go together: what a whole block pulls
+    is one observation. Blocks of 1, 2 and 4 times `block_m` are tried where at least 14 of them
+    hold points, and the largest answer counts, since bending is slower than any one block; for
+    small objects the block shrinks instead. Widened by (b - 1) / (b - 8), so that the expected
+    squared error in units of the covariance is right for b blocks. None: too few blocks.
+    """
+    best: NDArray[np.float64] | None = None
+    scale = np.array([length_m] * 3 + [1.0] * 3)
+    for growth in _BLOCK_GROWTH:
+        block, count = blocks_of(pairs.points, block_m * growth)
+        if count < _LEAST_BLOCKS or (best is not None and growth < 1.0):
+            continue
+        H, g = normal_equations(
+            pairs.points - centre, pairs.normals, pairs.residuals, weights, block, count
+        )
+        H_all, g_all = H.sum(axis=0), g.sum(axis=0)
+        steps = np.array([solve(H_all - H[b], g_all - g[b], dof, length_m) for b in range(count)])
+        steps -= steps.mean(axis=0)
+        covariance = (count - 1) / count * steps.T @ steps * ((count - 1) / (count - 8))
+        size = np.trace(covariance * np.outer(scale, scale))
+        if best is None or size > np.trace(best * np.outer(scale, scale)):
+            best = covariance
+    return best
+
+
+def unobservable(
+    pairs: Pairs,
+    weights: Values,
+    centre: NDArray[np.float64],
+    dof: int,
+    length_m: float,
+    block_m: float,
+) -> tuple[Mapping[str, Any], ...]:
+    """Return the motions that the shared surface does not hold, in words.
+
+    The information's eigenvectors (rotation scaled to motion at `length_m`) are tested one by
+    one: how much surface, in how many blocks, faces the motion? A plane slides along itself, a
+    cylinder turns about its axis: there nothing faces it.
+    """
+    total = float(weights.sum())
+    if total <= 0.0:
+        return ()
+    arms = pairs.points - centre
+    rows = np.concatenate([np.cross(arms, pairs.normals) / length_m, pairs.normals], axis=1)
+    free = list(FREE[dof])
+    values, vectors = np.linalg.eigh((rows[:, free] * weights[:, None]).T @ rows[:, free])
+    block, count = blocks_of(pairs.points, block_m)
+    found = []
+    for k in range(len(values)):
+        vector = np.zeros(6)
+        vector[free] = vectors[:, k]
+        motion = np.cross(vector[:3] / length_m, arms) + vector[3:]
+        along = np.abs(rows @ vector)
+        facing = along > _FACING * np.maximum(np.linalg.norm(motion, axis=1), 0.3)
+        share = float(weights[facing].sum()) / total
+        held = np.bincount(block[facing], weights[facing], count) > 0.02 * total / count
+        if share < _LEAST_FACING_SHARE or int(held.sum()) < min(_LEAST_FACING_BLOCKS, count):
+            found.append(_described(vector, length_m))
+    return tuple(found)
+
+
+def loose_directions(
+    covariance: NDArray[np.float64] | None, length_m: float
+) -> tuple[Mapping[str, Any], ...]:
+    """Return the motions whose jackknife sigma, as motion at `length_m`, is above 5 cm."""
+    if covariance is None:
+        return ()
+    scale = np.array([length_m] * 3 + [1.0] * 3)
+    values, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
+    return tuple(
+        _described(vectors[:, k], length_m) for k in range(6) if values[k] > _LOOSE_SIGMA_M**2
+    )
+
+
+def _described(vector: NDArray[np.float64], length_m: float) -> Mapping[str, Any]:
+    """Return {"vector": (omega rad, v m) of 1 m motion, "text": words}."""
+    turn, shift = vector[:3], vector[3:]
+    if np.linalg.norm(shift) >= np.linalg.norm(turn):
+        text = f"slides {_direction(shift)}"
+        if np.linalg.norm(turn) > 0.35:
+            text += f", turning about {_axis(turn)}"
+    else:
+        text = f"turns about {_axis(turn)} near the middle of the overlap"
+        if np.linalg.norm(shift) > 0.35:
+            text += f", sliding {_direction(shift)}"
+    scaled = vector.copy()
+    scaled[:3] /= length_m
+    return {"vector": scaled.tolist(), "text": text}
+
+
+def _direction(vector: NDArray[np.float64]) -> str:
+    unit = vector / np.linalg.norm(vector)
+    if abs(unit[2]) > 0.9:
+        return "up and down"
+    bearing = np.degrees(np.arctan2(unit[1], unit[0])) % 180.0
+    text = f"along the direction {bearing:.0f} deg from +x towards +y"
+    if abs(unit[2]) > 0.2:
+        text += f", rising {np.degrees(np.arcsin(abs(unit[2]))):.0f} deg"
+    return text
+
+
+def _axis(vector: NDArray[np.float64]) -> str:
+    unit = vector / np.linalg.norm(vector)
+    return "the vertical" if abs(unit[2]) > 0.9 else f"an axis {_direction(vector)}"
+
+
+def displacement95(
+    covariance: NDArray[np.float64], centre: NDArray[np.float64], points: Points
+) -> float:
+    """Return the 95 % displacement, metres, that a pose's covariance expects at `points` (n, 3).
+
+    1.96 sigma of the whole displacement at each point (exact where one direction is weak, else
+    cautious), at the 95th percentile of the points.
+    """
+    arms = points - centre
+    # d(omega x arm + v) / d(omega, v) = [-[arm]x, I]
+    J = np.zeros((len(arms), 3, 6))
+    for axis in range(3):
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        J[:, axis, first] = arms[:, second]
+        J[:, axis, second] = -arms[:, first]
+        J[:, axis, 3 + axis] = 1.0
+    variance = np.einsum("nij,jk,nik->n", J, covariance, J)
+    return float(1.96 * np.sqrt(np.quantile(np.clip(variance, 0.0, None), 0.95)))

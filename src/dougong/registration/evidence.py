@@ -1,0 +1,248 @@
+"""What each point of two clouds says about a pose: how badly the other cloud contradicts it.
+
+One number per point, 0 (explained) to 1 (contradicted), worked out on the same points for every
+pose, so that poses can be compared pair by pair (METHOD.md 2.3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dougong.registration.overlap import (
+    Rung,
+    apply,
+    do_agree,
+    inverse,
+    nearest,
+    rung,
+)
+from dougong.registration.prepare import Prepared
+from dougong.typing import Mask, Points, Transform, Values
+
+_JUDGED_POINTS = 15_000
+_SEARCHED_POINTS = 250_000
+# Bending and roughness of a drone cloud that no rigid pose can take away.
+_BENDING_M = 0.03
+_RAMP_M = 0.3
+_GROUND_SHARE = 0.1
+# Nearly as bad as contradicted: else a pose could win by moving the clouds apart.
+_OUTSIDE = 0.8
+_AWAY_M = 0.5
+_AWAY_UP_M = 0.3
+_AWAY_SPACINGS = 2.0
+_VIOLATION = 1.5
+_ABOVE_TOP_M = 0.75
+_NORMAL_COSINE = float(np.cos(np.radians(45.0)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Plan:
+    """Which cells in plan a cloud covers, and the highest surface over each (its DSM)."""
+
+    low: NDArray[np.float64]
+    cell_m: float
+    covered: NDArray[np.bool_]
+    top: NDArray[np.float64]
+
+    def at(self, points: Points) -> tuple[Mask, Values]:
+        """Return is_inside and the top (-inf outside) for `points` (n, 3)."""
+        place = np.floor((points[:, :2] - self.low) / self.cell_m)
+        is_on: Mask = np.all((place >= 0) & (place < self.covered.shape), axis=1)
+        i, j = np.where(is_on[:, None], place, 0.0).astype(np.int64).T
+        is_inside: Mask = is_on & self.covered[i, j]
+        return is_inside, np.where(is_on, self.top[i, j], -np.inf)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Witness:
+    """One cloud: the points that are heard, and all that others are compared with."""
+
+    points: Points
+    normals: Points
+    weights: Values
+    """(n,) square metres, flat ones more, ground a tenth: flat ground agrees with any pose."""
+    is_structure: Mask
+    """(n,) flat and standing above the ground."""
+    everything: Rung
+    slack: Values
+    """Half-distance between neighbours of `everything`: what a gap between points may add."""
+    plan: _Plan
+    sees_tops: bool
+    """Taken from above: what stands higher than its surface contradicts it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Court:
+    """Both clouds and the distance at which a point counts as explained."""
+
+    source: Witness
+    target: Witness
+    tolerance_m: float
+
+    @property
+    def weights(self) -> Values:
+        """Weights of source points, then target points."""
+        return np.concatenate([self.source.weights, self.target.weights])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Testimony:
+    """What all points, source's then target's, say about one pose."""
+
+    T: Transform
+    loss: Values
+    """(m,) 0 explained .. 1 contradicted, 1.5 where free space is violated; 0.8 outside the
+    other cloud's plan, where nothing can be said."""
+    is_explained: Mask
+    is_comparable: Mask
+    """(m,) the other cloud shows something near."""
+    is_inside: Mask
+    """(m,) inside the other cloud's plan."""
+    total: float
+    """Weighted mean loss."""
+
+
+def summon(source: Prepared, target: Prepared) -> Court:
+    """Return the court in which all poses of a pair are heard."""
+    spacing = max(source.spacing_m, target.spacing_m)
+    sigma = float(np.hypot(source.sigma_m, target.sigma_m))
+    return Court(
+        source=_witness(source),
+        target=_witness(target),
+        tolerance_m=min(3.0 * sigma + _BENDING_M, 0.15) + 0.1 * spacing,
+    )
+
+
+def _witness(prepared: Prepared) -> Witness:
+    everything = rung(prepared, prepared.spacing_m, _SEARCHED_POINTS, _JUDGED_POINTS)
+    heard = everything.index[everything.asked]
+    planarity = np.clip(prepared.planarity[heard], 0.0, 1.0)
+    is_ground = prepared.is_ground[heard]
+    area = prepared.weights_area[heard]
+    area = np.minimum(area / max(float(np.median(area)), 1e-12), 3.0)
+    return Witness(
+        points=prepared.xyz[heard],
+        normals=prepared.normals[heard],
+        weights=area * np.square(planarity) * np.where(is_ground, _GROUND_SHARE, 1.0),
+        is_structure=(planarity > 0.7) & ~is_ground,
+        everything=everything,
+        slack=0.75 * np.sqrt(prepared.weights_area[everything.index]),
+        plan=_plan(prepared),
+        sees_tops=prepared.kind == "photogrammetry",
+    )
+
+
+def _plan(prepared: Prepared) -> _Plan:
+    cell = max(1.0, 4.0 * prepared.spacing_m)
+    low = prepared.xyz[:, :2].min(axis=0) - 2.0 * cell
+    ij = np.floor((prepared.xyz[:, :2] - low) / cell).astype(np.int64)
+    size = ij.max(axis=0) + 3
+    top = np.full(tuple(size), -np.inf)
+    np.maximum.at(top, (ij[:, 0], ij[:, 1]), prepared.xyz[:, 2])
+    wide = top.copy()
+    for axis in (0, 1):
+        wide = np.maximum(wide, np.maximum(np.roll(wide, 1, axis), np.roll(wide, -1, axis)))
+    # Only whole surfaces: a cell counts as covered where its surroundings are.
+    return _Plan(low=low, cell_m=cell, covered=np.isfinite(wide), top=wide)
+
+
+def hear(court: Court, T: Transform) -> Testimony:
+    """Return what both clouds' points say about `T` (source -> target)."""
+    one = _hear_one(court.source, court.target, T, court.tolerance_m)
+    two = _hear_one(court.target, court.source, inverse(T), court.tolerance_m)
+    loss, explained, comparable, inside = (
+        np.concatenate([a, b]) for a, b in zip(one, two, strict=True)
+    )
+    weights = court.weights
+    return Testimony(
+        T=T,
+        loss=loss,
+        is_explained=explained,
+        is_comparable=comparable,
+        is_inside=inside,
+        total=float(weights @ loss / max(float(weights.sum()), 1e-300)),
+    )
+
+
+def _hear_one(
+    from_: Witness, to: Witness, T: Transform, tolerance_m: float
+) -> tuple[Values, Mask, Mask, Mask]:
+    moved = apply(T, from_.points)
+    normals = from_.normals @ T[:3, :3].T
+    reach = tolerance_m + _RAMP_M
+    distance, index = nearest(to.everything.tree, moved, 2.0 * reach)
+    is_near = np.isfinite(distance)
+    index = np.where(is_near, index, 0)
+    other = to.everything.normals[index]
+    offset = moved - to.everything.xyz[index]
+    across = np.abs(np.einsum("ij,ij->i", other, offset))
+    along = np.abs(np.einsum("ij,ij->i", normals, offset))
+    # Either plane may be the noisy one: the smaller distance is the fairer.
+    error = np.maximum(np.minimum(across, along), distance - to.slack[index] - tolerance_m)
+    is_alike = do_agree(normals, other, False, _NORMAL_COSINE)
+    error = np.where(is_near & is_alike, error, np.inf)
+    is_inside, top = to.plan.at(moved)
+    loss = np.where(is_inside, np.clip((error - tolerance_m) / _RAMP_M, 0.0, 1.0), _OUTSIDE)
+    if to.sees_tops:
+        loss[is_inside & (moved[:, 2] > top + _ABOVE_TOP_M)] = _VIOLATION
+    is_explained = is_inside & (error <= tolerance_m)
+    return loss, is_explained, is_near & is_inside, is_inside
+
+
+def structure_weights(court: Court) -> Values:
+    """Return the weights (m,) of flat points above the ground, 0 for all others."""
+    return np.concatenate([w.weights * w.is_structure for w in (court.source, court.target)])
+
+
+def support(court: Court, testimony: Testimony) -> float:
+    """Return the share of structure near the other cloud that a pose explains.
+
+    Among structure points that have some of the other cloud within about 0.7 m. The better of
+    the two clouds counts: one may see what the other cannot.
+    """
+    weights, split = structure_weights(court), len(court.source.points)
+    best = 0.0
+    for part in (slice(0, split), slice(split, None)):
+        domain = float(weights[part] @ testimony.is_comparable[part])
+        # A cloud that has next to nothing in common cannot vouch for the pose.
+        if domain > 0.1 * float(weights[part].sum()):
+            best = max(best, float(weights[part] @ testimony.is_explained[part]) / domain)
+    return best
+
+
+def violation(court: Court, testimony: Testimony) -> float:
+    """Return the share of structure inside the other's plan that stands in its free space."""
+    weights = structure_weights(court)
+    inside = float(weights @ testimony.is_inside)
+    return float(weights @ (testimony.loss > 1.0)) / max(inside, 1e-300)
+
+
+def sharpness(court: Court, testimony: Testimony) -> float:
+    """Return how many times more structure a pose explains than the poses 0.6 m around it.
+
+    The largest of eight neighbours counts, half a metre away in plan and 0.3 m up or down (less
+    for small objects, more for clouds whose points lie farther apart than 0.25 m). Two clouds of
+    different places fit equally badly everywhere: about 1. Sensors that show little in common
+    lower what is explained at the pose and beside it alike.
+    """
+    weights = structure_weights(court)
+    size = float(np.ptp(court.source.points, axis=0).max())
+    scale = min(1.0, max(size / 20.0, 6.0 * court.tolerance_m) / _AWAY_M)
+    # What a thin cloud shows reaches as far as its points lie apart: look beyond that.
+    spacing = max(court.source.everything.spacing_m, court.target.everything.spacing_m)
+    scale = max(scale, _AWAY_SPACINGS * spacing / _AWAY_M)
+    around = 0.0
+    for k in range(8):
+        away = testimony.T.copy()
+        turn = k * np.pi / 4.0
+        away[:3, 3] += scale * np.array(
+            [_AWAY_M * np.cos(turn), _AWAY_M * np.sin(turn), _AWAY_UP_M * (-1.0) ** k]
+        )
+        around = max(around, float(weights @ hear(court, away).is_explained))
+    here = float(weights @ testimony.is_explained)
+    # Chance explains a few percent anywhere: ratios of less mean nothing.
+    floor = 0.02 * float(weights.sum())
+    return here / max(around, floor, 1e-300)

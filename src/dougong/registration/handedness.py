@@ -1,0 +1,82 @@
+"""Is one cloud left-handed? The mirror image of the source, heard on the very same points.
+
+Most heritage buildings equal their own mirror image, so a left-handed export of one can be laid
+on the target well; what is beside the building then stands wrong. Hence the winner's reflections
+are refined and heard like any other rival (METHOD.md 2.3 and 7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from dougong.registration.evidence import Court, Testimony, Witness, hear
+from dougong.registration.icp import Icp, Level, refine_levels
+from dougong.registration.overlap import Rung
+from dougong.registration.rivals import propose_mirrored
+from dougong.registration.verdict import Verdict, compare, is_beaten
+
+Handedness = Literal["right", "left", "unknown"]
+
+_FLIP = np.array([-1.0, 1.0, 1.0])
+_TRIED = 3
+_SUSPICION = 0.05
+"""Chance below which blocks that prefer the mirror image are believed."""
+LEFT_SENTENCE = (
+    "the mirror image of the source fits clearly better than the source: one file is "
+    "left-handed. Export it again with x and y in the right order and sign (negate x, or swap "
+    "x and y)."
+)
+
+
+def handedness(
+    court: Court, levels: tuple[Level, ...], winner: Testimony, icp: Icp, params: Verdict
+) -> Handedness:
+    """Say whether the source's mirror image fits clearly worse ("right") or better ("left").
+
+    "unknown": the blocks cannot tell, as when all that both clouds show equals its mirror image.
+    """
+    poses = propose_mirrored(court, winner, _TRIED)
+    if not poses:
+        return "right"
+    other = replace(court, source=_mirrored_witness(court.source))
+    mirrored = tuple(
+        replace(level, source=_mirrored_rung(level.source), up_source=level.up_source * _FLIP)
+        for level in levels
+    )
+    flip = np.diag([*_FLIP, 1.0])
+    heard = [hear(other, refine_levels(mirrored, T @ flip, icp).T_target_source) for T in poses]
+    best = min(heard, key=lambda testimony: testimony.total)
+    if is_beaten(compare(court, winner, best, params.block_m), params):
+        return "right"
+    lead = compare(other, best, winner, params.block_m)
+    # Suspicion is enough: a pose taken for right is the worse mistake.
+    is_left = lead.gain >= params.gain and lead.p_value <= _SUSPICION
+    return "left" if is_left else "unknown"
+
+
+def _mirrored_witness(witness: Witness) -> Witness:
+    """Return `witness` with x negated, its points in the same order."""
+    plan = witness.plan
+    high = plan.low[0] + plan.cell_m * plan.covered.shape[0]
+    return replace(
+        witness,
+        points=witness.points * _FLIP,
+        normals=witness.normals * _FLIP,
+        everything=_mirrored_rung(witness.everything),
+        plan=replace(
+            plan,
+            low=np.array([-high, plan.low[1]]),
+            covered=plan.covered[::-1],
+            top=plan.top[::-1],
+        ),
+    )
+
+
+def _mirrored_rung(rung: Rung) -> Rung:
+    xyz = rung.xyz * _FLIP
+    tree = cKDTree(xyz, balanced_tree=False)
+    return replace(rung, xyz=xyz, normals=rung.normals * _FLIP, tree=tree)

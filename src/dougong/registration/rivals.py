@@ -1,0 +1,204 @@
+"""Poses that a nearly symmetric or repetitive building could take for the found one.
+
+A coarse search may not list them, so they are made here: turns about the middle of what fits,
+and shifts along it. Most fit badly and are dropped at once; those that fit are refined and heard
+like every other pose (METHOD.md 2.3).
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dougong.registration.evidence import Court, Testimony
+from dougong.registration.icp_solve import rotation_of
+from dougong.registration.overlap import apply, do_agree, nearest
+from dougong.typing import Mask, Points, Transform, Values
+
+SAME_YAW_DEG = 5.0
+SAME_SHIFT_M = 0.5
+_SAMPLE = 1500
+_TURN_STEP_DEG = 5.0
+_SHIFT_STEP_M = 0.25
+_REACH_M = 1.0
+# Of what the winner itself reaches in the quick score, a pose worth refining reaches so much.
+_WORTH = 0.4
+
+
+def is_same(a: Transform, b: Transform, at: NDArray[np.float64]) -> bool:
+    """Say whether two poses (source -> target) are one: within 5 degrees and 0.5 m.
+
+    `at` (3,) is the middle of the source's structure: a turn about a far origin is no shift.
+    """
+    turn = a[:3, :3] @ b[:3, :3].T
+    angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
+    shift = np.linalg.norm(apply(a, at[None]) - apply(b, at[None]))
+    return bool(angle < SAME_YAW_DEG and shift < SAME_SHIFT_M)
+
+
+def middle_of(points: Points) -> NDArray[np.float64]:
+    """Return the middle (3,) of the smallest rectangle in plan round `points`, median height."""
+    low, high = np.quantile(points, [0.005, 0.995], axis=0)
+    inside = points[((points >= low) & (points <= high)).all(axis=1)]
+    origin = inside.mean(axis=0)
+    rectangle = cv2.minAreaRect((inside[:, :2] - origin[:2]).astype(np.float32))
+    return np.array([*(np.array(rectangle[0]) + origin[:2]), np.median(inside[:, 2])])
+
+
+def propose_rivals(court: Court, winner: Testimony, most: int) -> list[Transform]:
+    """Return starting poses that could rival the winner's: `most` turns, half as many shifts.
+
+    They are the peaks, away from the winner, of a quick score over turns (every 5 degrees) about
+    the middle of the explained structure, of all the source's and of all the target's structure,
+    and over shifts along the structure's two axes (every 0.25 m, up to half its length).
+    """
+    split = len(court.source.points)
+    explained = court.source.is_structure & winner.is_explained[:split]
+    if int(explained.sum()) < 50 or int(court.target.is_structure.sum()) < 50:
+        return []
+    structure = apply(winner.T, court.source.points[court.source.is_structure])
+    normals = court.source.normals[court.source.is_structure] @ winner.T[:3, :3].T
+    middles = _middles(court, winner, explained)
+    shifts = _shifts(structure)
+    step = max(1, len(structure) // _SAMPLE)
+    structure, normals = structure[::step], normals[::step]
+    worth = _WORTH * _quick_score(court, np.eye(4), structure, normals)
+    turns = [move for middle in middles for move in _turns(middle)]
+    rivals: list[Transform] = []
+    for families, count in (([turns], most), (shifts, most // 2)):
+        found: list[tuple[float, Transform]] = []
+        for family in families:
+            scores = np.array([_quick_score(court, move, structure, normals) for move in family])
+            found += [(scores[k], family[k]) for k in _peaks(scores) if scores[k] > worth]
+        found.sort(key=lambda item: -item[0])
+        kept: list[Transform] = []
+        for _, move in found:
+            if not any(is_same(move, other, middles[0]) for other in kept):
+                kept.append(move)
+        rivals += [_settled(court, move, structure, normals) for move in kept[:count]]
+    return [move @ winner.T for move in rivals]
+
+
+def propose_mirrored(court: Court, winner: Testimony, most: int) -> list[Transform]:
+    """Return poses (improper, source -> target) that lay the source's mirror image on the target.
+
+    Reflections of the winner in upright planes through the middles of the structure, every 2.5
+    degrees: what a left-handed file of a building that nearly equals its own mirror image needs.
+    """
+    split = len(court.source.points)
+    explained = court.source.is_structure & winner.is_explained[:split]
+    if int(explained.sum()) < 50 or int(court.target.is_structure.sum()) < 50:
+        return []
+    structure = apply(winner.T, court.source.points[court.source.is_structure])
+    normals = court.source.normals[court.source.is_structure] @ winner.T[:3, :3].T
+    step = max(1, len(structure) // (_SAMPLE // 2))
+    structure, normals = structure[::step], normals[::step]
+    found: list[tuple[float, Transform]] = []
+    middles = _middles(court, winner, explained)
+    for middle in middles[:2]:
+        family = _reflections(middle)
+        scores = np.array([_quick_score(court, move, structure, normals) for move in family])
+        # The family closes on itself: no end leans on anything.
+        is_peak = (scores >= np.roll(scores, 1)) & (scores > np.roll(scores, -1))
+        found += [(scores[k], family[k]) for k in np.flatnonzero(is_peak)]
+    found.sort(key=lambda item: -item[0])
+    kept: list[Transform] = []
+    for _, move in found:
+        if not any(is_same(move, other, middles[0]) for other in kept):
+            kept.append(move)
+    return [_settled(court, move, structure, normals) @ winner.T for move in kept[:most]]
+
+
+def _middles(court: Court, winner: Testimony, explained: Mask) -> list[NDArray[np.float64]]:
+    """Return the middles (3,) of the explained, all the source's, all the target's structure."""
+    return [
+        middle_of(apply(winner.T, court.source.points[explained])),
+        middle_of(apply(winner.T, court.source.points[court.source.is_structure])),
+        middle_of(court.target.points[court.target.is_structure]),
+    ]
+
+
+def _reflections(middle: NDArray[np.float64]) -> list[Transform]:
+    """Return the reflections in upright planes through `middle`, every half turn step."""
+    moves = []
+    for angle in np.radians(np.arange(0.0, 360.0, _TURN_STEP_DEG)):
+        move = np.eye(4)
+        move[:3, :3] = rotation_of(np.array([0.0, 0.0, angle])) @ np.diag([-1.0, 1.0, 1.0])
+        move[:3, 3] = middle - move[:3, :3] @ middle
+        moves.append(move)
+    return moves
+
+
+def _turns(middle: NDArray[np.float64]) -> list[Transform]:
+    """Return the turns about the vertical through `middle`, 10 to 350 degrees."""
+    moves = []
+    for angle in np.arange(2 * _TURN_STEP_DEG, 360.0 - _TURN_STEP_DEG, _TURN_STEP_DEG):
+        move = np.eye(4)
+        move[:3, :3] = rotation_of(np.array([0.0, 0.0, np.radians(angle)]))
+        move[:3, 3] = middle - move[:3, :3] @ middle
+        moves.append(move)
+    return moves
+
+
+def _shifts(points: Points) -> list[list[Transform]]:
+    """Return the shifts both ways along both axes of the structure's plan."""
+    centred = points[:, :2] - points[:, :2].mean(axis=0)
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    families = []
+    for axis in axes.T:
+        along = centred @ axis
+        half = 0.5 * float(np.quantile(along, 0.99) - np.quantile(along, 0.01))
+        steps = np.arange(2 * _SHIFT_STEP_M, max(min(half, 20.0), 1.0), _SHIFT_STEP_M)
+        for sign in (1.0, -1.0):
+            family = []
+            for step in steps:
+                move = np.eye(4)
+                move[:2, 3] = sign * step * axis
+                family.append(move)
+            families.append(family)
+    return families
+
+
+def _settled(court: Court, move: Transform, points: Points, normals: Points) -> Transform:
+    """Return `move` shifted in plan, up to 3 m, to where it fits best, the reach shrinking.
+
+    The middles are rough and columns repeat: from half a metre off, the fit may settle beside.
+    """
+    step = max(1, len(points) // 600)
+    points, normals = points[::step], normals[::step]
+    best = move
+    for grid, reach in ((0.6, _REACH_M), (0.2, 0.4 * _REACH_M)):
+        centre, best_score = best, -1.0
+        reached = 5 if grid > 0.5 else 3
+        for i, j in itertools.product(range(-reached, reached + 1), repeat=2):
+            trial = centre.copy()
+            trial[:2, 3] += (grid * i, grid * j)
+            score = _quick_score(court, trial, points, normals, reach)
+            if score > best_score:
+                best, best_score = trial, score
+    return best
+
+
+def _quick_score(
+    court: Court, move: Transform, points: Points, normals: Points, reach_m: float = _REACH_M
+) -> float:
+    """Return how near `points` (n, 3) come to like surfaces within `reach_m` after `move`."""
+    everything = court.target.everything
+    distance, index = nearest(everything.tree, apply(move, points), reach_m)
+    is_near = np.isfinite(distance)
+    turned = normals @ move[:3, :3].T
+    other = everything.normals[np.where(is_near, index, 0)]
+    closeness = np.where(is_near, 1.0 - distance / reach_m, 0.0)
+    return float(np.mean(closeness * do_agree(turned, other, False, 0.7)))
+
+
+def _peaks(scores: Values) -> list[int]:
+    """Return the places of local maxima inside; the ends lean on the winner or on nothing."""
+    if len(scores) < 3:
+        return []
+    padded = np.concatenate([[np.inf], scores, [np.inf]])
+    is_peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:])
+    return [int(k) for k in np.flatnonzero(is_peak)]

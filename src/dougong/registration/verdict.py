@@ -1,0 +1,257 @@
+"""The proof: which refined poses the data can tell apart, and whether the best one holds.
+
+Hypotheses are compared pair by pair on the same points, summed over blocks of about 5 m, so that
+errors which neighbouring points share count once (METHOD.md 2.3). A raster score or an RMSE is
+not evidence: a round building turned by 180 degrees fits almost as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy import stats
+
+from dougong.params import Parameters
+from dougong.registration.covariance import blocks_of
+from dougong.registration.evidence import Court, Testimony, hear, sharpness, support, violation
+from dougong.registration.icp import Icp, Level, refine_levels
+from dougong.registration.overlap import apply, inverse
+from dougong.registration.result import FineResult, Status
+from dougong.registration.rivals import is_same, middle_of, propose_rivals
+from dougong.typing import Transform, Values
+
+
+class Verdict(Parameters):
+    """How sure the proof has to be."""
+
+    block_m: Annotated[float, Field(gt=0)] = 5.0
+    """Edge of the blocks that count as one observation each."""
+    p_value: Annotated[float, Field(gt=0, lt=0.5)] = 1e-3
+    """A rival is beaten when the blocks' evidence for it is rarer than this by chance."""
+    gain: Annotated[float, Field(gt=0, lt=1)] = 0.05
+    """A rival is beaten only when the winner also contradicts this much less of the surface."""
+    least_overlap: Annotated[float, Field(ge=0, le=1)] = 0.2
+    """Less shared surface than this proves nothing."""
+    least_explained: Annotated[float, Field(ge=0, le=1)] = 0.25
+    """Share of the structure near the other cloud that the pose must explain."""
+    least_sharpness: Annotated[float, Field(ge=1)] = 2.0
+    """So many times more structure must be explained at the pose than half a metre beside it."""
+    most_violation: Annotated[float, Field(ge=0, le=1)] = 0.08
+    """Share of the structure that may stand where the other cloud saw free space."""
+    most_spread_m: Annotated[float, Field(gt=0)] = 0.1
+    """By how much the blocks may disagree about the pose, as 95 % displacement of the shared
+    surface: thin or rough clouds find the place, but not to the centimetre, and are told so."""
+    poses: Annotated[int, Field(ge=1)] = 8
+    """So many coarse hypotheses are refined."""
+    rivals: Annotated[int, Field(ge=0)] = 6
+    """So many poses made by turning the winner, and half as many by shifting, are refined too."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """One rival against the winner."""
+
+    T: Transform
+    gain: float
+    """Weighted mean loss of the rival minus the winner's, over all points: > 0 for the winner."""
+    p_value: float
+    """Chance of so much evidence for the winner if blocks did not prefer either."""
+    blocks: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ruling:
+    """What the court says about a pair."""
+
+    winner: Testimony
+    undecided: tuple[Comparison, ...]
+    """Rivals that the data cannot tell from the winner, closest first."""
+    beaten: tuple[Comparison, ...]
+    explained: float
+    """Share of the structure that both clouds show near each other, see `support`."""
+    sharpness: float
+    violation: float
+    probability: float
+
+
+def compare(court: Court, winner: Testimony, rival: Testimony, block_m: float) -> Comparison:
+    """Return the paired block comparison of two poses.
+
+    Blocks lie in the source's frame; target points are put there by the winner's pose, so that
+    what both clouds say about one place counts once. Student's t over blocks, its degrees of
+    freedom the effective number of blocks that carry the difference.
+    """
+    back = apply(inverse(winner.T), court.target.points)
+    places = np.concatenate([court.source.points, back])
+    extent = np.ptp(places, axis=0).max()
+    block, count = blocks_of(places, min(block_m, max(float(extent) / 8.0, 1e-6)))
+    weights = court.weights
+    difference = weights * (rival.loss - winner.loss)
+    sums: Values = np.bincount(block, difference, count).astype(np.float64)
+    mass = np.bincount(block, weights, count)
+    gain = float(sums.sum() / max(float(mass.sum()), 1e-300))
+    sums = _telling(sums[mass > 0.0])
+    size = float(np.abs(sums).sum())
+    if size <= 0.0 or len(sums) < 3:
+        return Comparison(T=rival.T, gain=gain, p_value=1.0, blocks=len(sums))
+    effective = size**2 / float(sums @ sums)
+    spread = float(np.sqrt(np.square(sums - sums.mean()).sum() * len(sums) / (len(sums) - 1)))
+    statistic = float(sums.sum()) / max(spread, 1e-300)
+    p_value = float(stats.t.sf(statistic, max(effective - 1.0, 1.0)))
+    return Comparison(T=rival.T, gain=gain, p_value=p_value, blocks=len(sums))
+
+
+def _telling(sums: Values) -> Values:
+    """Return the block sums that carry 99 % of the difference, whichever pose they prefer.
+
+    Empty ground says nothing about either pose; counted as blocks it would drown the few walls.
+    """
+    order = np.argsort(-np.abs(sums), kind="stable")
+    share = np.cumsum(np.abs(sums[order]))
+    if not len(share) or share[-1] <= 0.0:
+        return sums
+    telling: Values = sums[order[: int(np.searchsorted(share, 0.99 * share[-1])) + 1]]
+    return telling
+
+
+def separate(poses: Sequence[Testimony], at: NDArray[np.float64]) -> list[Testimony]:
+    """Return `poses`, best first, without those that are the same as a better one."""
+    kept: list[Testimony] = []
+    for pose in sorted(poses, key=lambda item: item.total):
+        if not any(is_same(pose.T, other.T, at) for other in kept):
+            kept.append(pose)
+    return kept
+
+
+def rule(
+    court: Court,
+    levels: tuple[Level, ...],
+    starts: Sequence[Transform],
+    icp: Icp,
+    params: Verdict,
+    is_allowed: Callable[[Transform], bool] = lambda _: True,
+) -> Ruling:
+    """Refine every start, add rivals of the best, and compare all with the best.
+
+    Parameters
+    ----------
+    levels : tuple of Level
+        Coarse levels: every pose is refined on them.
+    starts : sequence of (4, 4)
+        Coarse poses, at least one.
+    is_allowed : callable
+        What a yaw hint leaves; other poses are rivals only while nothing else is left.
+    """
+    at = middle_of(court.source.points)
+    poses = [_refined(court, levels, T, icp) for T in starts[: params.poses]]
+    poses = separate(poses, at)
+    rivals = propose_rivals(court, poses[0], params.rivals)
+    poses = separate([*poses, *(_refined(court, levels, T, icp) for T in rivals)], at)
+    poses = [pose for pose in poses if is_allowed(pose.T)] or poses
+    winner, others = poses[0], poses[1:]
+    results = [compare(court, winner, other, params.block_m) for other in others]
+    beaten = [c for c in results if is_beaten(c, params)]
+    undecided = [c for c in results if not is_beaten(c, params)]
+    explained, sharp = support(court, winner), sharpness(court, winner)
+    return Ruling(
+        winner=winner,
+        undecided=tuple(sorted(undecided, key=lambda c: c.gain)),
+        beaten=tuple(sorted(beaten, key=lambda c: c.gain)),
+        explained=explained,
+        sharpness=sharp,
+        violation=violation(court, winner),
+        probability=_probability(undecided, beaten, sharp, params),
+    )
+
+
+def is_beaten(comparison: Comparison, params: Verdict) -> bool:
+    """Say whether the data tell a rival from the winner.
+
+    A difference three times as large as asked may be ten times less rare: small sites have few
+    blocks, and a handful of walls cannot be rarer than that.
+    """
+    limit = params.p_value * (10.0 if comparison.gain >= 3.0 * params.gain else 1.0)
+    return comparison.gain >= params.gain and comparison.p_value <= limit
+
+
+def _refined(court: Court, levels: tuple[Level, ...], T: Transform, icp: Icp) -> Testimony:
+    return hear(court, refine_levels(levels, T, icp).T_target_source)
+
+
+def _probability(
+    undecided: Sequence[Comparison],
+    beaten: Sequence[Comparison],
+    sharp: float,
+    params: Verdict,
+) -> float:
+    """Return a cautious probability that the winner is right.
+
+    Undecided rivals share the belief equally; each beaten one keeps its p-value, never less than
+    1e-3; a pose that explains hardly more than its surroundings cannot be probable.
+    """
+    rest = 1.0 + len(undecided) + sum(max(c.p_value, 1e-3) for c in beaten)
+    trust = np.clip((sharp - 1.0) / (params.least_sharpness - 1.0), 0.0, 1.0)
+    return float(min(0.999, 1.0 / rest) * trust)
+
+
+def status_of(ruling: Ruling, fine: FineResult | None, params: Verdict) -> tuple[Status, str]:
+    """Return the status and, in words, what was seen and what would decide."""
+    if fine is not None and fine.fitness <= 0.0:
+        return "failed", "no pose lays one cloud on the other: nothing matches after refinement."
+    overlap = max(fine.overlap_source, fine.overlap_target) if fine is not None else 1.0
+    if ruling.sharpness < params.least_sharpness or ruling.explained < params.least_explained:
+        return "failed", (
+            f"the best pose explains {ruling.explained:.0%} of the structure near the other cloud, "
+            f"{ruling.sharpness:.1f} times what a pose half a metre beside it does (at least "
+            f"{params.least_explained:.0%} and {params.least_sharpness:g} times expected). Are "
+            "these two clouds of the same place, in the same unit, and do they overlap?"
+        )
+    if overlap < params.least_overlap:
+        return "failed", (
+            f"only {overlap:.0%} of either cloud has the other within reach (at least "
+            f"{params.least_overlap:.0%} expected). Scan more of what both show."
+        )
+    if ruling.violation > params.most_violation:
+        return "failed", (
+            f"under the best pose {ruling.violation:.0%} of the structure stands where the other "
+            f"cloud saw free space (at most {params.most_violation:.0%} expected): the true pose "
+            "was not found, or the place was rebuilt. A yaw hint or control points would help."
+        )
+    if ruling.undecided:
+        return "ambiguous", _rivals_in_words(ruling)
+    loose: Sequence[Mapping[str, Any]] = fine.unobservable if fine is not None else ()
+    if loose:
+        texts = "; ".join(str(item["text"]) for item in loose)
+        return "ambiguous", (
+            f"the shared surface does not hold the pose: it {texts}. Control points, or surface "
+            "facing that way in both clouds, would decide."
+        )
+    beaten = (
+        f"the next pose contradicts {ruling.beaten[0].gain:.1%} more of the surface "
+        f"(p = {max(ruling.beaten[0].p_value, 1e-9):.1g} over {ruling.beaten[0].blocks} blocks)"
+        if ruling.beaten
+        else "no other pose fits at all"
+    )
+    return "ok", (
+        f"the pose explains {ruling.explained:.0%} of the structure near the other cloud, "
+        f"{ruling.sharpness:.1f} times what a pose half a metre beside it does; {beaten}."
+    )
+
+
+def _rivals_in_words(ruling: Ruling) -> str:
+    poses = [c.T for c in ruling.undecided]
+    turns = []
+    for T in poses:
+        turn = T[:3, :3] @ ruling.winner.T[:3, :3].T
+        turns.append(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
+    listed = ", ".join(f"{turn:+.0f} deg" for turn in turns[:6])
+    return (
+        f"{len(poses) + 1} poses explain the clouds about equally well; from the best the others "
+        f"are turned by {listed} (or shifted). A yaw hint, control points, or more of the site "
+        "around the building would decide."
+    )

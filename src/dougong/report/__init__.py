@@ -1,0 +1,5 @@
+"""The report: one self-contained HTML page that says what was done and how sure it is."""
+
+from dougong.report.render import build
+
+__all__ = ["build"]

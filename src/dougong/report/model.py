@@ -1,0 +1,370 @@
+"""The report as plain data: what is said, before anything is drawn."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+Tone = Literal["good", "unsure", "bad"]
+TONES: dict[str, Tone] = {"ok": "good", "ambiguous": "unsure", "failed": "bad"}
+WORDS: dict[Tone, str] = {"good": "Registered", "unsure": "Ambiguous", "bad": "Not registered"}
+NO_CHECKS = (
+    "No independent check points were given: no accuracy grade is stated. The numbers on this "
+    "page say how well the clouds fit each other, not how well they fit the world."
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeyNumber:
+    """One of the three numbers of the first screen."""
+
+    label: str
+    value: str
+    unit: str
+    definition: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """The first thing a reader sees."""
+
+    tone: Tone
+    word: str
+    sentence: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CloudRow:
+    """What the filters did to one cloud."""
+
+    name: str
+    kind: str
+    files: tuple[str, ...]
+    points_in: int
+    points_out: int
+    stages: tuple[Mapping[str, Any], ...]
+    frame: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Link:
+    """One registration, ready to be laid out."""
+
+    source: str
+    target: str
+    tone: Tone
+    word: str
+    reason: str
+    facts: tuple[tuple[str, str], ...]
+    """Name and value, both with their units."""
+    matrix: tuple[tuple[str, ...], ...]
+    hypotheses: tuple[Mapping[str, Any], ...]
+    margin: float
+    unobservable: tuple[str, ...]
+    history_mm: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Report:
+    """Everything the page says."""
+
+    title: str
+    subtitle: str
+    verdict: Verdict
+    key_numbers: tuple[KeyNumber, ...]
+    checks: str
+    clouds: tuple[CloudRow, ...]
+    links: tuple[Link, ...]
+    notes: tuple[str, ...]
+    outputs: tuple[tuple[str, str], ...]
+    inputs: tuple[Mapping[str, Any], ...]
+    parameters: tuple[tuple[str, str], ...]
+    provenance: tuple[tuple[str, str], ...]
+    legend: tuple[tuple[str, str], ...] = field(default=())
+    """Cloud name and colour (CSS)."""
+
+
+def from_run(result: Mapping[str, Any], demo: Mapping[str, Any] | None) -> Report:
+    """Return the report of a run (and of a demo, where its errors against truth are known)."""
+    links = tuple(link(document) for document in result["registrations"])
+    return Report(
+        title=result["project"],
+        subtitle=_subtitle(result),
+        verdict=_run_verdict(result, demo),
+        key_numbers=_key_numbers(result, demo),
+        checks=NO_CHECKS,
+        clouds=tuple(_cloud(cloud) for cloud in result["clouds"]),
+        links=links,
+        notes=tuple(result["notes"]),
+        outputs=(
+            ("merged.copc.laz", f"{result['merged']['points']:,} points, source_id per cloud"),
+            ("clouds/", "each filtered cloud in the frame of the reference"),
+            ("registrations/", "the transform of each cloud with its proof"),
+            ("result.json", "everything on this page for machines"),
+        ),
+        inputs=tuple(result["inputs"]),
+        parameters=tuple(flat(result["parameters"])),
+        provenance=_provenance(result),
+    )
+
+
+def from_registration(document: Mapping[str, Any]) -> Report:
+    """Return the report of a single registration."""
+    only = link(document)
+    return Report(
+        title=f"{document['source']} onto {document['target']}",
+        subtitle="Registration of two clouds",
+        verdict=Verdict(tone=only.tone, word=only.word, sentence=sentence(document["reason"])),
+        key_numbers=tuple(_fit_numbers([document])),
+        checks=NO_CHECKS,
+        clouds=(),
+        links=(only,),
+        notes=tuple(document["notes"]),
+        outputs=(("registration.json", "the transform with its proof, for machines"),),
+        inputs=tuple(document["inputs"]),
+        parameters=tuple(flat(document["parameters"])),
+        provenance=_provenance(document),
+    )
+
+
+def _subtitle(result: Mapping[str, Any]) -> str:
+    kinds = [cloud["kind"] for cloud in result["clouds"]]
+    counted = [
+        f"{kinds.count(kind)} {word}{'s' if kinds.count(kind) > 1 else ''}"
+        for kind, word in (("lidar", "laser scan cloud"), ("photogrammetry", "drone cloud"))
+        if kind in kinds
+    ]
+    return f"{' and '.join(counted)}, in the frame of {result['reference']}"
+
+
+def sentence(text: str) -> str:
+    """Return `text` with a capital at its start and a stop at its end."""
+    text = text.strip()
+    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
+
+
+def _run_verdict(result: Mapping[str, Any], demo: Mapping[str, Any] | None) -> Verdict:
+    documents = result["registrations"]
+    tone = TONES[result["status"]]
+    if not documents:
+        words = "One cloud was given, so it was filtered; there was nothing to register."
+        return Verdict(tone="good", word="Filtered", sentence=words)
+    sure = sum(document["status"] == "ok" for document in documents)
+    if demo is not None and demo["tre95_m"] is not None:
+        words = (
+            f"The pose lies {1000 * demo['tre95_m']:.1f} mm from the truth (95 % of the surface): "
+            f"{demo['verdict']}."
+        )
+    elif len(documents) == 1:
+        words = sentence(documents[0]["reason"])
+    else:
+        words = f"{sure} of {len(documents)} clouds were registered with certainty."
+    if tone != "good":
+        words += f" The merged cloud holds only: {', '.join(result['merged']['clouds'])}."
+    return Verdict(tone=tone, word=WORDS[tone], sentence=words)
+
+
+def _key_numbers(
+    result: Mapping[str, Any], demo: Mapping[str, Any] | None
+) -> tuple[KeyNumber, ...]:
+    if demo is not None and demo["tre95_m"] is not None:
+        return _truth_numbers(demo)
+    if result["registrations"]:
+        return tuple(_fit_numbers(result["registrations"]))
+    cloud = result["clouds"][0]
+    return (
+        KeyNumber(
+            label="Points in",
+            value=f"{cloud['points_in']:,}",
+            unit="",
+            definition="points with finite coordinates in the input files",
+        ),
+        KeyNumber(
+            label="Points kept",
+            value=f"{cloud['points_out']:,}",
+            unit="",
+            definition="original points, selected and never changed",
+        ),
+        KeyNumber(
+            label="Reduction",
+            value=f"{100 * cloud['reduction']:.2f}",
+            unit="%",
+            definition="data reduction rate: 1 - points kept / points in",
+        ),
+    )
+
+
+def _truth_numbers(demo: Mapping[str, Any]) -> tuple[KeyNumber, ...]:
+    return (
+        KeyNumber(
+            label="Pose error (TRE95)",
+            value=f"{1000 * demo['tre95_m']:.1f}",
+            unit="mm",
+            definition=(
+                "95 % of the surface that both sensors saw lies nearer than this to where the "
+                "best possible pose would put it"
+            ),
+        ),
+        KeyNumber(
+            label="Rotation error",
+            value=f"{demo['rotation_error_deg']:.4f}",
+            unit="deg",
+            definition="angle between the pose found and the best possible pose",
+        ),
+        KeyNumber(
+            label="Bending floor",
+            value=f"{1000 * demo['bending_floor95_m']:.1f}",
+            unit="mm",
+            definition=(
+                "95 % residual that the best rigid pose itself leaves, since the drone cloud is "
+                "slowly bent; no rigid registration can do better"
+            ),
+        ),
+    )
+
+
+def _fit_numbers(documents: Sequence[Mapping[str, Any]]) -> list[KeyNumber]:
+    fines = [document["fine"] for document in documents if document["fine"]]
+    rmse = [fine["inlier_rmse_m"] for fine in fines if fine["inlier_rmse_m"] is not None]
+    margin = min(document["coarse"]["margin"] for document in documents)
+    worst = " (the worst of all links)" if len(documents) > 1 else ""
+    reach = max((fine["max_distance_m"] for fine in fines), default=None)
+    return [
+        KeyNumber(
+            label="Inlier RMSE",
+            value=f"{1000 * max(rmse):.1f}" if rmse else "none",
+            unit="mm" if rmse else "",
+            definition=(
+                "root mean square residual of the correspondences"
+                + (f" within {1000 * reach:.0f} mm" if reach else "")
+                + f"{worst}; a measure of fit, not of accuracy"
+            ),
+        ),
+        KeyNumber(
+            label="Overlap",
+            value=f"{100 * min(fine['overlap_source'] for fine in fines):.0f}" if fines else "none",
+            unit="%" if fines else "",
+            definition=f"share of the moved cloud with the other cloud within that distance{worst}",
+        ),
+        KeyNumber(
+            label="Margin",
+            value=f"{margin:.2f}",
+            unit="",
+            definition=(
+                "1 - s2/s1: how far the best coarse pose leads the next one that lies more than "
+                f"5 deg or 0.5 m away; 0 is a tie, 1 is no rival{worst}"
+            ),
+        ),
+    ]
+
+
+def _cloud(cloud: Mapping[str, Any]) -> CloudRow:
+    return CloudRow(
+        name=cloud["name"],
+        kind=cloud["kind"],
+        files=tuple(cloud["files"]),
+        points_in=cloud["points_in"],
+        points_out=cloud["points_out"],
+        stages=tuple(cloud["stages"]),
+        frame=cloud["frame"],
+    )
+
+
+def link(document: Mapping[str, Any]) -> Link:
+    """Return one registration document as rows of words and numbers."""
+    tone = TONES[document["status"]]
+    fine = document["fine"]
+    history = [step.get("inlier_rmse_m") for step in (fine or {}).get("history", [])]
+    return Link(
+        source=document["source"],
+        target=document["target"],
+        tone=tone,
+        word=WORDS[tone],
+        reason=sentence(document["reason"]),
+        facts=tuple(_facts(document)),
+        matrix=_matrix(document["matrix"]),
+        hypotheses=tuple(document["coarse"]["hypotheses"][:8]),
+        margin=document["coarse"]["margin"],
+        unobservable=tuple(direction["text"] for direction in document["unobservable"]),
+        history_mm=tuple(1000 * value for value in history if value is not None),
+    )
+
+
+def _matrix(matrix: Sequence[Sequence[float]] | None) -> tuple[tuple[str, ...], ...]:
+    """Return a matrix as text: ten digits of rotation, a tenth of a millimetre of shift."""
+    rows = [[*(f"{value:.10f}" for value in row[:3]), f"{row[3]:.4f}"] for row in matrix or ()]
+    return tuple(map(tuple, rows))
+
+
+def _facts(document: Mapping[str, Any]) -> list[tuple[str, str]]:
+    coarse, fine = document["coarse"], document["fine"]
+    facts = [
+        ("coarse method", f"{coarse['method']}, {len(coarse['hypotheses'])} hypotheses"),
+        ("degrees of freedom", f"{document['dof']}"),
+        ("scale", f"{document['scale']:.8g}"),
+        ("probability that it is this pose", f"{document['probability']:.3f}"),
+    ]
+    if fine:
+        rmse = fine["inlier_rmse_m"]
+        bound = f"within {1000 * fine['max_distance_m']:.0f} mm"
+        facts += [
+            (
+                "fine method",
+                f"{fine['method']}, {fine['iterations']} iterations: {fine['stopped']}",
+            ),
+            ("inlier RMSE", f"{1000 * rmse:.2f} mm, {bound}" if rmse is not None else "none"),
+            ("fitness (inliers / source points)", f"{fine['fitness']:.3f}"),
+            ("overlap of source, of target", _overlap(fine, bound)),
+        ]
+    spread = _spread(document["covariance"])
+    if spread:
+        facts.append(("standard deviation of the fit", spread))
+    return facts
+
+
+def _overlap(fine: Mapping[str, Any], bound: str) -> str:
+    return f"{100 * fine['overlap_source']:.1f} %, {100 * fine['overlap_target']:.1f} % ({bound})"
+
+
+def _spread(covariance: Sequence[Sequence[float]] | None) -> str:
+    if covariance is None:
+        return ""
+    sigma = np.sqrt(np.maximum(np.diag(np.array(covariance)), 0.0))
+    turn, shift = np.degrees(np.linalg.norm(sigma[:3])), 1000 * np.linalg.norm(sigma[3:6])
+    return f"{turn:.4f} deg, {shift:.1f} mm, at the middle of the overlap"
+
+
+def flat(values: Any, path: str = "") -> list[tuple[str, str]]:
+    """Return nested parameters as (dotted name, value) rows."""
+    if isinstance(values, Mapping):
+        rows = []
+        for key, value in values.items():
+            rows += flat(value, f"{path}.{key}" if path else str(key))
+        return rows
+    if isinstance(values, list) and values and isinstance(values[0], Mapping):
+        rows = []
+        for index, value in enumerate(values, 1):
+            rows += flat(value, f"{path}[{index}]")
+        return rows
+    if values is None:
+        return [(path, "not set")]
+    return [(path, ", ".join(map(str, values)) if isinstance(values, list) else str(values))]
+
+
+def _provenance(document: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    software = document["software"]
+    libraries = ", ".join(f"{name} {number}" for name, number in software["libraries"].items())
+    seconds = ", ".join(f"{name} {value:.1f} s" for name, value in document["seconds"].items())
+    peak = document["peak_memory_bytes"]
+    rows = [
+        ("dougong", software["dougong"]),
+        ("finished", document.get("finished_utc") or "not recorded"),
+        ("time", seconds),
+        ("peak memory", f"{peak / 1e9:.2f} GB" if peak else "not told by this system"),
+        ("Python", f"{software['python']} on {software['platform']}"),
+        ("libraries", libraries),
+    ]
+    if document.get("result_hash"):
+        rows.insert(1, ("result hash (SHA-256)", document["result_hash"]))
+    return tuple(rows)

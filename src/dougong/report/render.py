@@ -1,0 +1,100 @@
+"""From a result folder to one self-contained HTML page."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+
+from dougong.errors import InputError
+from dougong.pipeline.outputs import write_text
+from dougong.report.figures import Figure, find_place, overview, slices
+from dougong.report.layers import Layer, pair_layers, run_layers
+from dougong.report.model import Report, from_registration, from_run
+from dougong.report.plates import line_chart
+from dougong.report.viewer import View3D, view_3d, why_missing
+
+
+def build(folder: Path) -> Path:
+    """Write ``report.html`` from the files in a result folder and return its path.
+
+    Raises
+    ------
+    InputError
+        The folder holds no result.
+    """
+    result, single = folder / "result.json", folder / "registration.json"
+    if result.is_file():
+        document = load(result)
+        demo = folder / "demo.json"
+        layers = run_layers(folder, document)
+        report = from_run(document, load(demo) if demo.is_file() else None)
+    elif single.is_file():
+        document = load(single)
+        layers = pair_layers(document)
+        report = from_registration(document)
+        if not layers:
+            note = "The input files are not where they were, so nothing could be drawn."
+            report = replace(report, notes=(*report.notes, note))
+    else:
+        msg = (
+            f"{folder} holds no result.json and no registration.json. Name the --out folder of "
+            "a run, a demo or a registration."
+        )
+        raise InputError(msg)
+    path = folder / "report.html"
+    write_text(path, render(report, layers))
+    return path
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Return the JSON document of a result folder."""
+    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return document
+
+
+def render(report: Report, layers: list[Layer]) -> str:
+    """Return the page. Everything is inside it: no request leaves it."""
+    report = replace(
+        report,
+        legend=tuple((layer.name, "rgb({}, {}, {})".format(*layer.colour)) for layer in layers),
+    )
+    general: list[Figure] = []
+    cuts: list[Figure] = []
+    three: View3D | None = None
+    missing = why_missing()
+    if layers:
+        place = find_place(layers)
+        general = overview(layers, place)
+        sure = [layer for layer in layers if layer.is_sure]
+        cuts = slices(sure, place) if len(sure) > 1 else []
+        three = view_3d(layers, place) if missing is None else None
+    return (
+        environment()
+        .get_template("report.html")
+        .render(report=report, overview=general, slices=cuts, three=three, missing=missing)
+    )
+
+
+def environment() -> jinja2.Environment:
+    """Return the template engine: everything escaped, unknown names refused."""
+    engine = jinja2.Environment(
+        loader=jinja2.PackageLoader("dougong.report", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    engine.filters["svg"] = Markup
+    engine.filters["count"] = lambda value: f"{value:,}"
+    engine.filters["percent"] = lambda value: f"{100 * value:.2f} %"
+    engine.filters["chart"] = _chart
+    engine.filters["built"] = Markup
+    return engine
+
+
+def _chart(link: Any) -> Markup:
+    label = "inlier RMSE over the iterations of the fine registration, millimetres"
+    return Markup(line_chart(link.history_mm, "mm", label))

@@ -1,0 +1,295 @@
+"""What ``dougong view`` shows: which clouds, where each lies, and what must be converted first."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dougong.errors import InputError
+from dougong.formats import FileInfo, describe, iterate, read, write
+from dougong.report.layers import BLUE, COLOURS
+from dougong.report.render import environment
+from dougong.report.server import Served
+from dougong.report.viewer import STATIC, why_missing
+from dougong.typing import Transform, Values
+
+_FAR_M = 20_000.0
+_SAMPLE = 100_000
+_UNCLASSIFIED = {0, 1}
+
+Note = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Item:
+    """One file to be shown."""
+
+    name: str
+    path: Path
+    T_shown_file: Transform = field(default_factory=lambda: np.eye(4))
+    """(4, 4) from the file's coordinates to those shown."""
+    sources: tuple[tuple[str, int], ...] = ()
+    """Name and source_id of each cloud in a merged file; empty: the file is one cloud."""
+    reference: str | None = None
+    turns: dict[str, Transform] = field(default_factory=dict)
+    """For a cloud that was registered: the matrix that did it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """A page and its clouds, ready to be served."""
+
+    things: dict[str, Served]
+    clouds: tuple[str, ...]
+    points: int
+    notes: tuple[str, ...]
+
+
+def items_of(paths: Sequence[Path]) -> tuple[list[Item], list[str]]:
+    """Return what is to be shown of files and result folders, and what is to be said about it.
+
+    Raises
+    ------
+    InputError
+        Nothing is named, a path is missing, or a folder holds no result.
+    """
+    if not paths:
+        raise InputError("nothing is named to view. Name clouds or a result folder.")
+    items: list[Item] = []
+    notes: list[str] = []
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"{path} does not exist. Name clouds or a result folder.")
+        if path.is_file():
+            items.append(Item(name=path.name, path=path))
+        elif (path / "result.json").is_file():
+            items.append(_merged(path, notes))
+        elif (path / "registration.json").is_file():
+            items += _pair(path)
+        else:
+            msg = (
+                f"{path} holds no result.json and no registration.json. Name the --out folder of "
+                "a run, a demo or a registration, or the clouds themselves."
+            )
+            raise InputError(msg)
+    return items, notes
+
+
+def _load(path: Path) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return document
+
+
+def _merged(folder: Path, notes: list[str]) -> Item:
+    """Return the merged cloud of a run."""
+    result = _load(folder / "result.json")
+    merged = result["merged"]
+    left = [cloud["name"] for cloud in result["clouds"] if cloud["name"] not in merged["clouds"]]
+    if left:
+        notes.append(f"{', '.join(left)}: not merged (no sure pose), so not shown")
+    ids = merged.get("source_ids") or {}
+    matrices = {entry["source"]: entry["matrix"] for entry in result["registrations"]}
+    return Item(
+        name=result["project"],
+        path=folder / merged["file"],
+        sources=tuple((name, int(ids[name])) for name in merged["clouds"] if name in ids),
+        reference=result["reference"],
+        turns={name: np.array(matrix) for name, matrix in matrices.items() if matrix is not None},
+    )
+
+
+def _pair(folder: Path) -> list[Item]:
+    """Return the two clouds of a registration, the source moved."""
+    document = _load(folder / "registration.json")
+    source, target = (Path(entry["path"]) for entry in document["inputs"])
+    for path in (source, target):
+        if not path.is_file():
+            raise InputError(f"{path}, an input of {folder}, is not there any more.")
+    if document["matrix"] is None:
+        return [Item(name=document["source"], path=source)]
+    matrix = np.array(document["matrix"])
+    moved = Item(
+        name=document["source"],
+        path=source,
+        T_shown_file=matrix,
+        turns={document["source"]: matrix},
+    )
+    return [moved, Item(name=document["target"], path=target, reference=document["target"])]
+
+
+def prepare(paths: Sequence[Path], scratch: Path, say: Note) -> Scene:
+    """Return the page for some clouds; those that are no COPC files are converted into `scratch`.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    scratch : Path
+        A folder for temporary files; needs about as much room as the clouds have as LAZ.
+    say : callable
+        Told what takes time.
+
+    Raises
+    ------
+    InputError
+        See `items_of`; or this installation has no viewer.
+    FormatError
+        A file cannot be read.
+    """
+    missing = why_missing()
+    if missing is not None:
+        raise InputError(f"there is nothing to view with: {missing}.")
+    items, notes = items_of(paths)
+    paths = [_streamable(item.path, scratch, index, say, notes) for index, item in enumerate(items)]
+    sources: list[dict[str, Any]] = []
+    clouds: list[dict[str, Any]] = []
+    colours = {"source", "height"}
+    origin, placed = _placed(items, paths, notes)
+    for index, (item, path) in enumerate(zip(items, paths, strict=True)):
+        look = _look(path)
+        colours |= look.pop("colours")
+        first = len(sources)
+        sources += _sources(item, first)
+        clouds.append(
+            {
+                "name": item.name,
+                "url": f"cloud/{index}",
+                "points": describe(path).points,
+                "to_local": placed[index].ravel().tolist(),
+                "source": first,
+                "source_ids": {code: first + n for n, (_, code) in enumerate(item.sources)} or None,
+                **look,
+            }
+        )
+    things = {
+        cloud["url"]: Served(kind="application/octet-stream", body=path.resolve())
+        for cloud, path in zip(clouds, paths, strict=True)
+    }
+    scene = {
+        "sources": sources,
+        "clouds": clouds,
+        "origin": origin.tolist(),
+        "yaw_deg": 0.0,
+        "colours": _order(colours, len(sources)),
+        "natural": "colours of the files; grey is intensity",
+        "precision_m": None,
+    }
+    return Scene(
+        things=things | _page(", ".join(item.name for item in items), scene),
+        clouds=tuple(source["name"] for source in sources),
+        points=sum(cloud["points"] for cloud in clouds),
+        notes=tuple(notes),
+    )
+
+
+def _placed(
+    items: list[Item], paths: Sequence[Path], notes: list[str]
+) -> tuple[Values, list[Transform]]:
+    """Return the origin of what is shown, and each file's (4, 4) map to metres about it."""
+    origin: Values | None = None
+    placed = []
+    for item, path in zip(items, paths, strict=True):
+        info = describe(path)
+        matrix: Transform = np.diag([*info.unit_m, 1.0]) @ item.T_shown_file
+        middle = (matrix @ np.append(_middle(info), 1.0))[:3]
+        origin = np.floor(middle) if origin is None else origin
+        shift = origin
+        away = float(np.linalg.norm(middle - origin))
+        if away > _FAR_M:
+            shift = np.floor(middle)
+            notes.append(
+                f"{item.name} lies {away / 1000:.0f} km from {items[0].name}: both are shown about "
+                "one middle, and the coordinates read from it are not its own"
+            )
+        matrix[:3, 3] -= shift
+        placed.append(matrix)
+    assert origin is not None
+    return origin, placed
+
+
+def _order(colours: set[str], sources: int) -> list[str]:
+    """Return the colourings on offer, the first one first."""
+    order = ["source", "height", "natural", "class"]
+    if sources == 1:
+        order = ["natural", "height", "class", "source"]
+    return [name for name in order if name in colours]
+
+
+def _page(title: str, scene: dict[str, Any]) -> dict[str, Served]:
+    style = (STATIC / "viewer.css").read_text(encoding="utf-8")
+    page = environment().get_template("view.html").render(title=title, scene=scene, style=style)
+    return {
+        "": Served(kind="text/html; charset=utf-8", body=page.encode()),
+        "view.js": Served(
+            kind="text/javascript; charset=utf-8", body=(STATIC / "view.js").read_bytes()
+        ),
+    }
+
+
+def _middle(info: FileInfo) -> Values:
+    """Return the middle (3,) of a file's extent, in its coordinates and units."""
+    if info.extent_min is None or info.extent_max is None:
+        raise InputError(f"{info.path.name} has no point with finite coordinates to show.")
+    middle: Values = (np.array(info.extent_min) + np.array(info.extent_max)) / 2
+    return middle
+
+
+def _streamable(path: Path, scratch: Path, index: int, say: Note, notes: list[str]) -> Path:
+    """Return the path of a COPC file with these points."""
+    info = describe(path)
+    if info.format == "COPC":
+        return path
+    say(f"converting {path.name} ({info.format}, {info.points:,} points) to COPC")
+    converted = scratch / f"{index}.copc.laz"
+    written = write(read(path), converted)
+    notes.append(
+        f"{path.name} is {info.format}, which cannot be streamed: a temporary COPC copy is shown "
+        f"({written.bytes / 1e6:.1f} MB, removed at the end)"
+    )
+    notes += [f"{path.name}: {note}" for note in written.notes]
+    return converted
+
+
+def _sources(item: Item, first: int) -> list[dict[str, Any]]:
+    """Return the clouds of one file as the viewer lists them."""
+    names = [name for name, _ in item.sources] or [item.name]
+    listed = []
+    for number, name in enumerate(names):
+        is_reference = name == item.reference
+        colour = COLOURS[(first + number) % len(COLOURS)]
+        turn = None
+        if name in item.turns:
+            # The rotation nearest to the inverse: units and scale are no motion.
+            u, _, v = np.linalg.svd(np.linalg.inv(item.turns[name][:3, :3]))
+            turn = (u @ v).ravel().tolist()
+        listed.append(
+            {
+                "name": name,
+                "colour": list(BLUE if is_reference else colour),
+                "role": "reference" if is_reference else None,
+                "motion": None,
+                "turn": turn,
+            }
+        )
+    return listed
+
+
+def _look(path: Path) -> dict[str, Any]:
+    """Return how a COPC file is coloured, by its first points (its coarsest level)."""
+    sample = next(iter(iterate(path, _SAMPLE)))
+    colours = set()
+    grey = [0.0, 65535.0]
+    intensity = sample.attribute("intensity")
+    if intensity is not None and intensity.any():
+        grey = [float(value) for value in np.percentile(intensity, [1, 99])]
+        colours.add("natural")
+    channels = [sample.attribute(name) for name in ("red", "green", "blue")]
+    peak = max((int(channel.max()) for channel in channels if channel is not None), default=0)
+    if peak:
+        colours.add("natural")
+    classes = sample.attribute("classification")
+    if classes is not None and set(np.unique(classes).tolist()) - _UNCLASSIFIED:
+        colours.add("class")
+    return {"grey": grey, "colour_bits": 16 if peak > 255 else 8, "colours": colours}

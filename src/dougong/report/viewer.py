@@ -1,0 +1,189 @@
+"""The 3-D view of the report: its scene, its points, and the script that the build put here."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dougong.report.figures import Place
+from dougong.report.layers import Layer
+from dougong.report.payload import (
+    MAX_POINTS,
+    REACH_M,
+    STEP_M,
+    Packed,
+    back_motion,
+    distances,
+    pack,
+    shares,
+    thinned,
+)
+from dougong.report.plates import round_length
+
+STATIC = Path(__file__).parent / "static"
+_EYE_M = 1.5
+"""Height of the first level slice: through walls and posts, not through the roof."""
+_LINE = 6000
+NOT_BUILT = (
+    "this copy of dougong was never built with its viewer; install it with pip, with the npm "
+    "registry in reach"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View3D:
+    """Everything a page needs to show the clouds in 3-D."""
+
+    scene: dict[str, Any]
+    clouds: tuple[Packed, ...]
+    script: str
+    style: str
+    lead: str
+
+
+def why_missing(static: Path = STATIC) -> str | None:
+    """Return why there is no viewer in this installation, None where there is one."""
+    record = static / "viewer.json"
+    if not record.is_file():
+        return NOT_BUILT
+    said: dict[str, Any] = json.loads(record.read_text(encoding="utf-8"))
+    return None if said["is_built"] else str(said.get("why") or NOT_BUILT)
+
+
+def view_3d(layers: list[Layer], place: Place, static: Path = STATIC) -> View3D:
+    """Return the 3-D view of what a report shows.
+
+    Parameters
+    ----------
+    layers : list of Layer
+    place : Place
+        What the views look at.
+    static : Path
+        Where the built viewer is.
+    """
+    shown = [layer for layer in layers if layer.is_placed and len(layer.after)]
+    allowed = shares([len(layer.after) for layer in shown], MAX_POINTS)
+    packed, found_all = [], []
+    for index, (layer, most) in enumerate(zip(shown, allowed, strict=True)):
+        chosen = thinned(layer.after, most)
+        others = [other.after for other in shown if other is not layer]
+        found = distances(layer.after[chosen], np.concatenate(others)) if others else None
+        if found is not None:
+            found_all.append(found[~np.isnan(found)])
+        packed.append(pack(layer, chosen, found, index))
+    return View3D(
+        scene=_scene(shown, place, packed, found_all),
+        clouds=tuple(packed),
+        script=(static / "report.js").read_text(encoding="utf-8"),
+        style=(static / "viewer.css").read_text(encoding="utf-8"),
+        lead=_lead(shown, packed),
+    )
+
+
+def _scene(
+    shown: list[Layer], place: Place, packed: list[Packed], found: list[Any]
+) -> dict[str, Any]:
+    classes = [np.unique(layer.classes) for layer in shown if layer.classes is not None]
+    present = sorted({int(code) for codes in classes for code in codes})
+    near = np.concatenate(found) if found else np.zeros(0)
+    colours = ["source", "height"]
+    colours += ["natural"] if any(layer.colours is not None for layer in shown) else []
+    colours += ["residual"] if len(near) else []
+    colours += ["class"] if set(present) - {0, 1} else []
+    if len(shown) == 1:
+        colours = [*colours[1:], "source"]
+    level = min(0.5, _EYE_M / (place.top - place.floor))
+    height = place.floor + level * (place.top - place.floor)
+    reach = max(float(np.abs(layer.after - place.centre).max()) for layer in shown)
+    return {
+        "sources": [_source(layer, place) for layer in shown],
+        "clouds": [cloud.head for cloud in packed],
+        "origin": (shown[0].origin if shown[0].origin is not None else np.zeros(3)).tolist(),
+        "centre": place.centre.tolist(),
+        "radius": place.radius,
+        "reach": reach,
+        "floor": place.floor,
+        "top": place.top,
+        "yaw_deg": place.yaw_deg,
+        "level": level,
+        "thickness_m": _thickness(shown, place, height),
+        "colours": colours,
+        "natural": _natural(shown),
+        "classes": present,
+        "precision_m": STEP_M / 2,
+        "residual": {"shown_m": _shown(near), "reach_m": REACH_M, "code_max_m": REACH_M},
+    }
+
+
+def _thickness(shown: list[Layer], place: Place, height: float) -> float:
+    """Return the thinnest level slice of those on offer in which the building is still a line."""
+    points = np.concatenate([layer.after for layer in shown])
+    points = points[np.hypot(*(points[:, :2] - place.centre[:2]).T) <= place.radius]
+    off = np.abs(points[:, 2] - height)
+    # The page holds fewer points than the layers do.
+    share = min(1.0, MAX_POINTS / max(sum(len(layer.after) for layer in shown), 1))
+    for thickness in (0.05, 0.1, 0.2):
+        if share * float((off <= thickness / 2).sum()) >= _LINE:
+            return thickness
+    return 0.5
+
+
+def _shown(near: Any) -> float:
+    """Return the end of the distance scale: a round length above nine tenths of the distances."""
+    if not len(near):
+        return 0.05
+    ninth = float(np.clip(np.percentile(near, 90), 0.004, REACH_M / 2))
+    return min(round_length(2.2 * ninth), REACH_M)
+
+
+def _source(layer: Layer, place: Place) -> dict[str, Any]:
+    """Return what the viewer must know of one cloud; its way back to where it was delivered."""
+    source: dict[str, Any] = {
+        "name": layer.name,
+        "colour": list(layer.colour),
+        "role": "reference" if layer.is_reference else None if layer.is_sure else "not sure",
+        "motion": None,
+    }
+    if layer.is_reference:
+        return source
+    own = layer.before
+    middle = np.median(own, axis=0)
+    inside = own[np.hypot(*(own[:, :2] - middle[:2]).T) <= place.radius]
+    middle[2] = np.percentile(inside[:, 2], 3)
+    matrix = back_motion(layer)
+    matrix[:3, 3] += np.array([*place.centre[:2], place.floor]) - middle
+    source["motion"] = matrix.ravel().tolist()
+    source["centre"] = np.median(layer.after, axis=0).tolist()
+    return source
+
+
+def _natural(shown: list[Layer]) -> str:
+    """Return what the natural colours are, per cloud where they differ."""
+    words = []
+    for layer in shown:
+        if layer.colours is None:
+            words.append(f"{layer.name}: no colour in the file")
+        elif layer.colours.shape[1] == 1:
+            words.append(f"{layer.name}: intensity as grey")
+        else:
+            words.append(f"{layer.name}: colours of the file")
+    return ", ".join(words)
+
+
+def _lead(shown: list[Layer], packed: list[Packed]) -> str:
+    count = sum(cloud.head["points"] for cloud in packed)
+    text = (
+        f"{count:,} points, evenly thinned for this page; positions rounded to "
+        f"{STEP_M * 1000:g} mm (off by {STEP_M * 500:g} mm at most along each axis). "
+    )
+    if any(not layer.is_reference for layer in shown):
+        text += (
+            "As delivered: every cloud in its own axes, set down about one middle and not turned. "
+        )
+    if len(shown) > 1:
+        text += (
+            "Distance: from a point to the plane through the 8 nearest points of the other clouds."
+        )
+    return text

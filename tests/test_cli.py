@@ -1,0 +1,334 @@
+"""The command line: what is loaded, what is printed where, exit codes, options, docs."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dougong
+from dougong.cli import call
+from dougong.cli._common import Common
+from dougong.cli._text import table
+from dougong.cloud import Cloud
+from dougong.errors import InputError
+
+ROOT = Path(__file__).parents[1]
+COMMANDS = [
+    "demo", "run", "init", "info", "check", "filter", "register", "transform", "report",
+    "view",
+]  # fmt: skip
+
+
+def python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments], capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+@pytest.fixture
+def room(tmp_path):
+    """A floor with a wall, as a LAZ file."""
+    rng = np.random.default_rng(0)
+    floor = rng.uniform([0, 0, 0], [12, 9, 0.01], (6000, 3))
+    wall = rng.uniform([2, 3, 0], [8, 3.02, 4], (6000, 3))
+    cloud = Cloud.from_points(np.vstack([floor, wall]) + [500_000, 4_000_000, 30])
+    path = tmp_path / "room.laz"
+    dougong.write(cloud, path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("code", "heavy"),
+    [
+        ("import dougong", {"numba", "scipy", "laspy", "numpy", "pydantic"}),
+        ("from dougong.cli import call; call(['--help'])", {"numba", "scipy", "laspy", "pydantic"}),
+        ("from dougong.cli import call; call(['run', '--help'])", {"numba", "scipy", "laspy"}),
+    ],
+)
+def test_importing_and_helping_load_nothing_heavy(code, heavy):
+    result = python("-c", f"{code}\nimport sys; print(sorted(sys.modules))")
+    loaded = set(re.findall(r"'([^'.]+)'", result.stdout.splitlines()[-1]))
+    assert result.returncode == 0
+    assert not heavy & loaded
+
+
+def test_public_names_load_when_asked_for():
+    for name in dougong.__all__:
+        assert getattr(dougong, name) is not None
+    assert set(dougong.__all__) <= set(dir(dougong))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = dougong.nothing
+
+
+def test_python_m_is_the_command():
+    result = python("-m", "dougong", "--version")
+    assert (result.returncode, result.stdout.strip()) == (0, dougong.__version__)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_helps_with_an_example(command, capsys):
+    assert call([command, "--help"]) == 0
+    said = capsys.readouterr().out
+    assert f"Example: dougong {command}" in said
+    assert "--json" in said
+
+
+@pytest.mark.parametrize(
+    ("tokens", "said"),
+    [
+        (["filtr"], "Did you mean"),
+        (["info", "a.laz", "--thread", "3"], "Did you mean --threads"),
+        (["demo", "--scene", "castle"], '"hall", "pagoda"'),
+        (["run", "--lidar", "a.laz"], "--out"),
+        (["info"], "no file is named"),
+        (["info", "a.laz", "--engine", "dask"], "--engine dask is not part of this version"),
+        (["info", "a.laz", "--memory", "lots"], "--memory needs a size"),
+        (["info", "a.laz", "--threads", "0"], "--threads must be 1 or more"),
+        (["register", "a", "b", "--out", "c", "--dof", "5"], "--dof"),
+    ],
+)
+def test_usage_errors_are_one_line_and_exit_2(tokens, said, capsys):
+    assert call(tokens) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("error: ")
+    assert said in err
+
+
+@pytest.mark.parametrize(
+    ("tokens", "kind", "code"),
+    [
+        (["info", "missing.laz", "--json"], "FormatError", 1),
+        (["info", "--json"], "InputError", 2),
+        (["nonsense", "--json"], "InputError", 2),
+        (["report", ".", "--json"], "InputError", 2),
+    ],
+)
+def test_json_errors_are_one_document(tokens, kind, code, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert call(tokens) == code
+    document = json.loads(capsys.readouterr().out)
+    assert set(document) == {"error"}
+    assert set(document["error"]) == {"type", "message", "exit_code"}
+    assert (document["error"]["type"], document["error"]["exit_code"]) == (kind, code)
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("4GB", 4 * 10**9), ("800 MB", 8 * 10**8), ("1.5GiB", 3 * 2**29), ("2g", 2 * 10**9)],
+)
+def test_memory_is_read_with_its_unit(text, size):
+    assert Common(memory=text).memory_bytes() == size
+
+
+@pytest.mark.parametrize("text", ["", "GB", "-1GB", "0GB", "4 apples"])
+def test_memory_that_is_no_size_is_refused(text):
+    with pytest.raises(InputError, match="--memory needs a size"):
+        Common(memory=text).memory_bytes()
+
+
+def test_info_and_check_tell_about_a_file(room, capsys):
+    assert call(["info", str(room), "--json", "--quiet"]) == 0
+    file = json.loads(capsys.readouterr().out)["files"][0]
+    assert file["points"] == 12_000
+    assert call(["info", str(room), "--quiet"]) == 0
+    assert "12,000" in capsys.readouterr().out
+    assert call(["check", str(room), "--json"]) == 0
+    findings = json.loads(capsys.readouterr().out)["files"][0]["findings"]
+    assert any("coordinate" in finding["text"] for finding in findings)
+
+
+def test_info_tells_what_a_person_reads(room, capsys):
+    assert call(["info", str(room), "--quiet"]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"crs +none; the numbers are taken as metres", said)
+    assert re.search(r"low corner +50000\d\S*  \S+  30", said)
+    assert "<" not in said, "types of attributes are for --json"
+
+
+def test_info_goes_on_after_an_unreadable_file_and_exits_1(room, capsys):
+    gone = room.with_name("gone.laz")
+    assert call(["info", str(gone), str(room), "--quiet"]) == 1
+    said = capsys.readouterr().out
+    assert "does not exist" in said
+    assert "12,000" in said
+    assert call(["info", str(gone), str(room), "--json"]) == 1
+    files = json.loads(capsys.readouterr().out)["files"]
+    assert (files[0]["path"], files[0]["error"]["type"]) == (str(gone), "FormatError")
+    assert files[1]["points"] == 12_000
+
+
+@pytest.mark.parametrize(
+    ("crs", "said"),
+    [("EPSG:4326", r"UTM zone 50N \(EPSG:32650\)"), ("EPSG:4978", "earth-centred")],
+)
+def test_degrees_and_earth_centred_clouds_are_refused_with_advice(crs, said, tmp_path, capsys):
+    points = np.random.default_rng(0).uniform([116, 39, 0], [116.01, 39.01, 50], (500, 3))
+    path, good = tmp_path / "bad.laz", tmp_path / "good.laz"
+    dougong.write(Cloud.from_points(points, crs=crs), path)
+    dougong.write(Cloud.from_points(points), good)
+    out = tmp_path / "out"
+    for tokens in (
+        ["filter", path, tmp_path / "out.laz", "--kind", "lidar"],
+        ["filter", path, tmp_path / "out.laz", "--only", "statistical"],
+        ["register", path, good, "--out", out],
+        ["register", good, path, "--out", out],
+        ["run", "--lidar", path, "--photogrammetry", good, "--out", out],
+    ):
+        assert call([*map(str, tokens), "--quiet"]) == 1
+        err = capsys.readouterr().err
+        assert re.search(said, err), tokens
+        assert err.count("\n") == 1
+        assert not out.exists()
+
+
+def test_check_of_a_broken_file_exits_1(tmp_path, capsys):
+    path = tmp_path / "broken.laz"
+    path.write_bytes(b"")
+    assert call(["check", str(path), "--quiet"]) == 1
+    assert "error: " in capsys.readouterr().out
+
+
+def test_a_job_larger_than_the_memory_setting_is_refused_before_it_starts(room, capsys):
+    out = room.with_name("out.laz")
+    tokens = ["filter", str(room), str(out), "--only", "statistical", "--memory", "100MB"]
+    assert call(tokens) == 2
+    assert "more than --memory" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_unexpected_errors_are_one_line_unless_debugged(room, capsys, monkeypatch):
+    def broken(path):
+        message = "boom"
+        raise RuntimeError(message)
+
+    monkeypatch.setattr("dougong.formats.describe", broken)
+    assert call(["info", str(room), "--quiet"]) == 1
+    err = capsys.readouterr().err
+    assert err == "error: unexpected RuntimeError: boom. Run again with --debug and report it.\n"
+    assert call(["info", str(room), "--quiet", "--debug"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_tables_set_figures_flush_right():
+    text = table([["a", "1"], ["bb", "1,000"]], ["name", "points"])
+    assert text.splitlines() == ["  name  points", "  a          1", "  bb     1,000"]
+
+
+def test_the_documented_commands_and_options_are_the_real_ones(capsys):
+    text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    sections = dict(re.findall(r"^## dougong (\w+)\n(.*?)(?=^## |\Z)", text, re.M | re.S))
+    assert list(sections) == COMMANDS
+    shared_text = re.search(r"^## Options of every command\n(.*?)^## ", text, re.M | re.S)
+    shared = set(re.findall(r"^\| `(--[a-z-]+)", shared_text[1], re.M))
+    for command, section in sections.items():
+        call([command, "--help"])
+        shown = capsys.readouterr().out
+        real = set(re.findall(r"^│[ *]+(?:[A-Z]+ )?(--[a-z-]+)", shown, re.M)) - {"--help"}
+        documented = set(re.findall(r"^\| `(--[a-z-]+)", section, re.M)) | shared
+        assert documented == real, command
+
+
+def test_what_is_no_readable_file_is_said_by_every_verb(tmp_path, capsys):
+    (tmp_path / "folder.laz").mkdir()
+    for name, said in (("folder.laz", "is a folder"), ("gone.laz", "does not exist")):
+        tokens = ["filter", str(tmp_path / name), str(tmp_path / "o.laz"), "--kind", "lidar"]
+        assert call([*tokens, "--quiet"]) == 1
+        assert said in capsys.readouterr().err
+        tokens = ["register", str(tmp_path / name), str(tmp_path / name), "--out"]
+        assert call([*tokens, str(tmp_path / "out"), "--quiet"]) == 1
+        assert said in capsys.readouterr().err
+
+
+def test_outputs_that_cannot_be_meant_are_usage_errors(room, capsys):
+    for output, said in (
+        (room, "is the input itself"),
+        (room.parent, "is a folder"),
+        (room.with_name("a.xyz"), "clouds are written as"),
+        (room.parent / "missing" / "a.laz", "is not a folder"),
+    ):
+        assert call(["filter", str(room), str(output), "--kind", "lidar", "--quiet"]) == 2
+        assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"status": "ok", "matrix": [["x"]]}', "four rows of four numbers"),
+        ('{"status": "ok", "matrix": [[1, 2], [3, 4]]}', "finite 4x4 matrix"),
+        ("[1]", "holds a list"),
+        ("\xff", "is no JSON file"),
+        (None, "cannot be read: Is a directory"),
+    ],
+)
+def test_a_matrix_file_that_is_none_is_one_sentence(room, text, said, capsys):
+    path = room.with_name("m.json")
+    path.mkdir() if text is None else path.write_text(text, encoding="latin-1")
+    tokens = ["transform", str(room), str(room.with_name("t.laz")), "--matrix", str(path)]
+    assert call([*tokens, "--quiet"]) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert "unexpected" not in err
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('[[cloud]]\nname="a"\nkind="lidar"\nfiles="a.laz"\n', "cloud.0.files.*expected a list"),
+        ('[[cloud]]\nname="a"\nkind="lidar"\nfiles=["a"]\n' * 2, r"cloud: two clouds are called"),
+        ('[project]\nreference="b"\n[[cloud]]\nname="a"\nkind="lidar"\nfiles=["a"]\n',
+         r"p\.toml: project\.reference names 'b', which is no cloud"),
+        ('[[cloud]]\nname="a/b"\nkind="lidar"\nfiles=["a"]\n', "got 'a/b': expected text that"),
+    ],
+)  # fmt: skip
+def test_a_wrong_project_is_told_in_words_and_without_its_contents(text, said, tmp_path, capsys):
+    (tmp_path / "p.toml").write_text(text)
+    tokens = ["run", str(tmp_path / "p.toml"), "--out", str(tmp_path / "out"), "--quiet"]
+    assert call(tokens) == 2
+    err = capsys.readouterr().err
+    assert re.search(said, err)
+    assert "{" not in err
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a Linux device")
+@pytest.mark.parametrize(
+    ("redirect", "code", "said"),
+    [
+        (">&-", 0, ""),
+        ("2>&-", 0, ""),
+        (">/dev/full", 1, "error: the answer could not be printed: No space left on device."),
+        ("2>/dev/full", 0, ""),
+    ],
+)
+def test_streams_that_take_nothing_are_no_accident(room, redirect, code, said):
+    command = f"{sys.executable} -m dougong info {room} {redirect}"
+    result = subprocess.run(
+        ["sh", "-c", command], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert result.returncode == code
+    assert "Traceback" not in result.stderr
+    assert said in result.stderr
+    if redirect.startswith("2"):
+        assert "12,000" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (["--json", "info", "a.laz"], ["info", "a.laz", "--json"]),
+        (["--threads", "2", "--quiet", "run"], ["run", "--threads", "2", "--quiet"]),
+        (["--threads=2", "check", "a"], ["check", "a", "--threads=2"]),
+        (["--version"], ["--version"]),
+        (["--seed"], ["--seed"]),
+        ([], []),
+    ],
+)
+def test_global_options_may_stand_before_the_command(given, expected):
+    from dougong.cli import command_first
+
+    assert command_first(given) == expected

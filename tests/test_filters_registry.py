@@ -1,0 +1,50 @@
+"""The table of filters says what the modules say, and costs nothing to read."""
+
+import subprocess
+import sys
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+from dougong import filters
+from dougong.errors import InputError
+
+NAMES = list(filters.FILTERS)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_row_is_what_its_module_declares(name):
+    spec = filters.FILTERS[name]
+    module = import_module(f"dougong.filters.{name}")
+    assert spec.kind == sys.modules[f"dougong.filters.{name}"].KIND
+    assert spec.params is getattr(filters, spec.model)
+    assert spec.verb is getattr(filters, name)
+    assert spec.halo_m(spec.params()) >= 0
+    assert module is not None
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_filter_takes_an_empty_cloud(name):
+    inputs = {"height_above_ground": np.empty(0)} if name == "pass_through" else {}
+    spec = filters.FILTERS[name]
+    chosen = spec.verb(np.empty((0, 3)), spec.params(), **inputs)
+    assert chosen.is_kept.shape == (0,)
+    assert all(len(values) == 0 for values in chosen.attributes.values())
+
+
+def test_names_are_found_as_people_write_them():
+    assert filters.find("Curvature-Weighted").name == "curvature_weighted"
+    with pytest.raises(InputError, match="Did you mean statistical"):
+        filters.find("statistcal")
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        filters.nothing  # noqa: B018
+
+
+def test_the_table_loads_no_kernel():
+    code = (
+        "import sys; from dougong.filters import FILTERS, CurvatureWeighted, Statistical, Radius, "
+        "OctreeVoxelGrid, PassThrough; print('numba' in sys.modules, 'scipy' in sys.modules)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["False", "False"]

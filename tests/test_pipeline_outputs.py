@@ -1,0 +1,149 @@
+"""Results appear whole or not at all."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from dougong.errors import InputError, OutputError
+from dougong.pipeline import outputs
+
+
+def test_a_folder_appears_only_when_all_of_it_is_there(tmp_path):
+    out = tmp_path / "result"
+    with outputs.result_folder(out) as part:
+        (part / "clouds").mkdir()
+        (part / "clouds" / "a.laz").write_bytes(b"1")
+        assert not out.exists()
+    assert (out / "clouds" / "a.laz").read_bytes() == b"1"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_a_failed_job_leaves_no_folder_and_no_part(tmp_path):
+    def job():
+        with outputs.result_folder(tmp_path / "result") as part:
+            (part / "half").write_text("x")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        job()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_writing_into_an_old_folder_keeps_files_of_others(tmp_path):
+    out = tmp_path / "result"
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    (out / "result.json").write_text("old")
+    with outputs.result_folder(out) as part:
+        (part / "result.json").write_text("new")
+    assert (out / "notes.txt").read_text() == "mine"
+    assert (out / "result.json").read_text() == "new"
+
+
+def test_cancelling_removes_what_was_begun_and_keeps_what_was_there(tmp_path):
+    finished = tmp_path / "a.laz"
+    finished.write_text("old")
+    job = outputs.result_folder(tmp_path / "result")
+    part = job.__enter__()
+    (part / "half").write_text("x")
+    with outputs.watched(finished):
+        outputs.part_of(finished).write_text("half")
+        outputs.remove_unfinished()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.laz"]
+    assert finished.read_text() == "old"
+
+
+def test_existing_results_are_refused_without_overwrite(tmp_path):
+    path = tmp_path / "a.laz"
+    path.touch()
+    with pytest.raises(InputError, match=r"exists already.*--overwrite"):
+        outputs.refuse_existing([path], overwrite=False)
+    outputs.refuse_existing([path], overwrite=True)
+    outputs.refuse_existing([tmp_path / "b.laz"], overwrite=False)
+
+
+def test_json_is_whole_and_strict(tmp_path):
+    path = tmp_path / "a.json"
+    outputs.write_json(path, {"name": "塔", "value": 1.5})
+    assert json.loads(path.read_text(encoding="utf-8")) == {"name": "塔", "value": 1.5}
+    with pytest.raises(ValueError, match="JSON"):
+        outputs.write_json(path, {"value": float("nan")})
+    assert json.loads(path.read_text(encoding="utf-8"))["value"] == 1.5
+
+
+def test_a_place_that_cannot_be_written_is_one_sentence(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="could not be written"):
+        outputs.write_text(tmp_path / "file" / "a.json", "x")
+    with (
+        pytest.raises(OutputError, match="cannot be made"),
+        outputs.result_folder(tmp_path / "file" / "out"),
+    ):
+        pass
+
+
+def part_of_process(folder, process, host=None):
+    path = folder / f".result.part-{host or platform.node()}-{process}"
+    path.mkdir()
+    return path
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are not asked for elsewhere")
+def test_two_jobs_into_one_folder_do_not_mix(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        theirs = part_of_process(tmp_path, other.pid)
+        with (
+            pytest.raises(OutputError, match=f"another dougong .process {other.pid}"),
+            outputs.result_folder(tmp_path / "result"),
+        ):
+            pass
+        assert theirs.is_dir()
+        other.communicate(b"\n")
+    with outputs.result_folder(tmp_path / "result") as part:
+        (part / "a").touch()
+    assert [path.name for path in tmp_path.iterdir()] == ["result"], "a killed job's rest is gone"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are not asked for elsewhere")
+def test_a_job_of_another_machine_is_not_taken_for_dead(tmp_path):
+    theirs = part_of_process(tmp_path, 1, host="elsewhere")
+    with (
+        pytest.raises(OutputError, match=r"on elsewhere.*if it is gone, delete"),
+        outputs.result_folder(tmp_path / "result"),
+    ):
+        pass
+    assert theirs.is_dir()
+
+
+def test_a_result_folder_that_is_a_file_is_refused_at_once(tmp_path):
+    (tmp_path / "result").touch()
+    with (
+        pytest.raises(OutputError, match="is a file, and the result is a folder"),
+        outputs.result_folder(tmp_path / "result"),
+    ):
+        pass
+
+
+def test_a_step_that_cannot_be_kept_is_one_sentence(tmp_path, monkeypatch):
+    import numpy as np
+
+    from dougong.cloud import Cloud
+    from dougong.pipeline.steps import Filtered
+    from dougong.pipeline.store import Store
+
+    def full(path, **_):
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("numpy.savez", full)
+    codes = np.zeros(1, np.uint8)
+    cloud = Cloud.from_points([[0.0, 0, 0]])
+    step = Filtered(cloud=cloud, codes=codes, ground_class=codes, stages=())
+    store = Store(tmp_path / "work", is_temporary=True)
+    with pytest.raises(OutputError, match=r"work could not be written: No space left.*--work"):
+        store.save("key", step)
+    assert list((tmp_path / "work").iterdir()) == []

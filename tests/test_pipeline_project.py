@@ -1,0 +1,145 @@
+"""The project file: strict, with errors that name the file and the key; paths and patterns."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from dougong.errors import InputError
+from dougong.formats import FileInfo
+from dougong.pipeline.guess import Guess, guess_kind, project_text
+from dougong.pipeline.project import Entry, files_of, from_files, read_project
+
+DOCS = Path(__file__).parents[1] / "docs" / "commands.md"
+GOOD = """
+[[cloud]]
+name = "scan"
+kind = "lidar"
+files = ["scan.laz"]
+[[cloud]]
+name = "drone"
+kind = "photogrammetry"
+files = ["drone.laz"]
+"""
+
+
+@pytest.fixture
+def project(tmp_path):
+    def write(text):
+        path = tmp_path / "project.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def test_the_documented_project_is_valid(project):
+    text = re.search(r"```toml\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.S)[1]
+    found = read_project(project(text))
+    assert found.reference() == "drone"
+    assert found.cloud[0].registered is False
+    assert found.filter.lidar.octree_voxel_grid.voxel_m == 0.005
+    assert found.registration.coarse == "auto"
+
+
+def test_the_reference_is_the_first_photogrammetry_cloud_else_the_first_lidar(project):
+    assert read_project(project(GOOD)).reference() == "drone"
+    only_scans = from_files([Path("b.laz"), Path("a.laz")], [])
+    assert only_scans.reference() == "b"
+    assert from_files([Path("a.laz")], [Path("x.copc.laz")]).reference() == "x"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "'cloud' is missing"),
+        ("[[cloud]]\nname='a'", r"'cloud\.0\.kind' is missing"),
+        (GOOD + "colour = 1", r"unknown name 'cloud\.1\.colour'"),
+        (GOOD.replace("photogrammetry", "drone"), r"cloud\.1\.kind, got 'drone': .*'lidar' or"),
+        (GOOD.replace('"drone"', '"scan"'), "two clouds are called 'scan'"),
+        ('[project]\nreference = "dron"' + GOOD, "names 'dron'.*did you mean 'drone'"),
+        (GOOD + "[registr]\ncoarse='auto'", "'registr', did you mean 'register'"),
+        (GOOD + "[register]\ndof=3", r"register\.dof"),
+        (GOOD + "[filter.lidar.octree_voxel_grid]\nvoxel=1", "did you mean 'voxel_m'"),
+        (GOOD + "[quality]\ncontrol='c.csv'", "does not use control points"),
+        (GOOD + "[quality]\nrequired_level='LOA20'", "independent check points"),
+        (GOOD.replace('"lidar"', '"lidar"\nscale_known = false'), "does not search the scale"),
+        (GOOD + "[[", "no valid TOML"),
+    ],
+)
+def test_a_wrong_project_names_file_key_value_and_what_was_expected(project, text, said):
+    path = project(text)
+    with pytest.raises(InputError, match=said) as caught:
+        read_project(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_project_says_how_to_get_one(tmp_path):
+    with pytest.raises(InputError, match="dougong init"):
+        read_project(tmp_path / "project.toml")
+    with pytest.raises(InputError, match="is a folder"):
+        read_project(tmp_path)
+
+
+def test_patterns_are_relative_sorted_and_name_each_file_once(tmp_path):
+    (tmp_path / "scans").mkdir()
+    for name in ("b.laz", "a.laz", "c.txt"):
+        (tmp_path / "scans" / name).touch()
+    entry = Entry(name="s", kind="lidar", files=("scans/b.laz", "scans/*.laz"))
+    assert [path.name for path in files_of(entry, tmp_path)] == ["b.laz", "a.laz"]
+    absolute = Entry(name="s", kind="lidar", files=(str(tmp_path / "scans" / "*.laz"),))
+    assert [path.name for path in files_of(absolute, Path("/"))] == ["a.laz", "b.laz"]
+    with pytest.raises(InputError, match=r"cloud 's': no file matches 'scan/\*.laz'"):
+        files_of(Entry(name="s", kind="lidar", files=("scan/*.laz",)), tmp_path)
+
+
+def test_a_file_name_with_brackets_is_found_as_it_is(tmp_path):
+    (tmp_path / "hall [1].laz").touch()
+    entry = Entry(name="s", kind="lidar", files=("hall [1].laz",))
+    assert files_of(entry, tmp_path) == [tmp_path / "hall [1].laz"]
+
+
+def test_two_clouds_of_one_stem_are_refused():
+    with pytest.raises(InputError, match="two clouds are called 'a'"):
+        from_files([Path("a.laz"), Path("b/a.e57")], [])
+    with pytest.raises(InputError, match="no cloud is named"):
+        from_files([], [])
+
+
+def info(format_name="LAZ", attributes=(), low=(0.0, 0.0, 0.0), crs=None, stations=1):
+    return FileInfo(
+        path=Path("a"), format=format_name, version="", points=10, bytes=1, is_compressed=False,
+        stations=stations, extent_min=low, extent_max=low, crs_wkt=crs,
+        attributes=dict.fromkeys(attributes, "uint16"),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("found", "kind"),
+    [
+        (info("E57", ("red", "green", "blue", "intensity")), "lidar"),
+        (info(attributes=("red", "green", "blue"), low=(5e5, 4e6, 0)), "photogrammetry"),
+        (info(attributes=("Red", "Green", "Blue", "intensity"), crs="PROJCS"), "photogrammetry"),
+        (info(attributes=("intensity",), low=(5e5, 4e6, 0)), "lidar"),
+        (info("PLY", ("red", "green", "blue")), "photogrammetry"),
+        (info(attributes=("red", "green", "blue", "intensity")), "lidar"),
+    ],
+)
+def test_sensors_are_guessed_from_what_files_hold(found, kind):
+    guessed, why = guess_kind(found)
+    assert guessed == kind
+    assert why
+
+
+def test_the_written_project_reads_back_whatever_the_names(project):
+    guesses = [
+        Guess(
+            name=name, file=Path(name + ".laz"), kind="lidar", why="no colour", stations=3, points=5
+        )
+        for name in ('an "odd" name', "祈年殿")
+    ]
+    found = read_project(project(project_text('A "site"', guesses, ["b.laz: it is empty"])))
+    assert [entry.name for entry in found.cloud] == ['an "odd" name', "祈年殿"]
+    assert found.cloud[0].files == ('an "odd" name.laz',)
+    assert found.project.name == 'A "site"'

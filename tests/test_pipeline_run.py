@@ -1,0 +1,177 @@
+"""The main job around the registration: who moves, what is merged, exit codes, what is kept."""
+
+import json
+
+import numpy as np
+import pytest
+
+import dougong
+from dougong.cli import call
+from dougong.cloud import Cloud
+from dougong.registration.result import Hypothesis, Registration
+
+SHIFT = np.array([3.0, -2.0, 0.5])
+
+
+def cloud(seed, offset=(0.0, 0.0, 0.0)):
+    rng = np.random.default_rng(seed)
+    floor = np.column_stack([rng.uniform(0, 10, (4000, 2)), rng.normal(0, 0.003, 4000)])
+    wall = np.column_stack([rng.uniform(3, 7, 2000), np.full(2000, 5.0), rng.uniform(0, 3, 2000)])
+    return Cloud.from_points(np.vstack([floor, wall]) + offset)
+
+
+def answer(status):
+    """A registration that says `status` and shifts by SHIFT."""
+
+    def register(source, target, params, *, source_kind, target_kind):
+        assert params.filtered
+        matrix = np.eye(4)
+        matrix[:3, 3] = SHIFT
+        found = status[source.name] if isinstance(status, dict) else status
+        return Registration(
+            status=found,
+            matrix=None if found == "failed" else matrix,
+            reason="as the test says",
+            probability=0.5,
+            scale=1.0,
+            dof=6,
+            coarse_method="plan",
+            hypotheses=(Hypothesis(T_target_source=matrix, score=0.7, method="plan"),),
+            margin=0.0,
+            fine=None,
+        )
+
+    return register
+
+
+@pytest.fixture
+def folder(tmp_path):
+    dougong.write(cloud(0), tmp_path / "one.laz")
+    dougong.write(cloud(1), tmp_path / "two.laz")
+    dougong.write(cloud(2, SHIFT), tmp_path / "map.laz")
+    return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def without_pictures(monkeypatch):
+    """The pages keep their words; drawing has tests of its own."""
+    monkeypatch.setattr("dougong.report.render.overview", lambda *_: [])
+    monkeypatch.setattr("dougong.report.render.slices", lambda *_: [])
+
+
+def run(capsys, *tokens):
+    code = call(["run", *map(str, tokens), "--json", "--quiet"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def clouds(folder, *, registered="true", more=""):
+    text = (
+        f'[[cloud]]\nname="scans"\nkind="lidar"\nfiles=["one.laz","two.laz"]\n'
+        f'registered={registered}\n[[cloud]]\nname="map"\nkind="photogrammetry"\n'
+        f'files=["map.laz"]\n{more}'
+    )
+    path = folder / "project.toml"
+    path.write_text(text)
+    return path
+
+
+def test_files_of_one_cloud_move_together(folder, capsys, monkeypatch):
+    monkeypatch.setattr("dougong.pipeline.run.register", answer("ok"))
+    code, result = run(capsys, clouds(folder), "--out", folder / "out")
+    assert code == 0
+    assert [entry["name"] for entry in result["clouds"]] == ["scans", "map"]
+    assert result["clouds"][0]["points_in"] == 12_000
+    assert result["merged"]["source_ids"] == {"scans": 1, "map": 2}
+    merged = dougong.read(folder / "out" / "merged.copc.laz")
+    assert len(merged) == sum(entry["points_out"] for entry in result["clouds"])
+    source = merged.attribute("source_id")
+    low = [merged.frame.to_file(merged.xyz[source == part]).min(axis=0) for part in (1, 2)]
+    np.testing.assert_allclose(low[0], low[1], atol=0.1)
+    both = dougong.read(folder / "out" / "clouds" / "scans.laz")
+    assert len(both) == result["clouds"][0]["points_out"]
+
+
+def test_stations_that_are_not_registered_move_by_themselves(folder, capsys, monkeypatch):
+    status = {"scans-1": "ok", "scans-2": "ambiguous"}
+    monkeypatch.setattr("dougong.pipeline.run.register", answer(status))
+    project = clouds(folder, registered="false")
+    code, result = run(capsys, project, "--out", folder / "out")
+    assert code == 3
+    assert result["status"] == "ambiguous"
+    assert result["merged"]["clouds"] == ["scans-1", "map"]
+    assert {path.name for path in (folder / "out" / "registrations").iterdir()} == {
+        "scans-1.json",
+        "scans-2.json",
+    }
+    own = dougong.read(folder / "out" / "clouds" / "scans-2.laz")
+    assert own.frame.to_file(own.xyz).min(axis=0)[0] < 0.1, "left in its own coordinates"
+    moved = dougong.read(folder / "out" / "clouds" / "scans-1.laz")
+    assert moved.frame.to_file(moved.xyz).min(axis=0)[0] > 2.9
+    page = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    assert "1 of 2 clouds were registered" in page
+    assert "holds only: scans-1, map" in page
+
+
+@pytest.mark.parametrize("status", ["ambiguous", "failed"])
+def test_an_unsure_pose_is_not_merged_and_exits_3(folder, status, capsys, monkeypatch):
+    monkeypatch.setattr("dougong.pipeline.run.register", answer(status))
+    tokens = ("--lidar", folder / "one.laz", "--photogrammetry", folder / "map.laz")
+    code, result = run(capsys, *tokens, "--out", folder / "out")
+    assert (code, result["status"], result["merged"]["clouds"]) == (3, status, ["map"])
+    assert len(dougong.read(folder / "out" / "merged.copc.laz")) == result["merged"]["points"]
+    document = json.loads((folder / "out" / "registrations" / "one.json").read_text())
+    assert (document["matrix"] is None) == (status == "failed")
+
+
+def test_the_best_pose_is_taken_when_the_project_says_so(folder, capsys, monkeypatch):
+    monkeypatch.setattr("dougong.pipeline.run.register", answer("ambiguous"))
+    project = clouds(folder, more="[register]\naccept_best = true\n")
+    code, result = run(capsys, project, "--out", folder / "out")
+    assert (code, result["status"]) == (0, "ambiguous")
+    assert result["merged"]["clouds"] == ["scans", "map"]
+
+
+def test_one_cloud_alone_is_only_filtered(folder, capsys):
+    code, result = run(capsys, "--lidar", folder / "one.laz", "--out", folder / "out")
+    assert (code, result["status"], result["registrations"]) == (0, "ok", [])
+    assert result["merged"]["clouds"] == ["one"]
+
+
+def test_the_result_hash_forgets_time_paths_and_point_order(folder, capsys):
+    first = run(capsys, "--lidar", folder / "one.laz", "--out", folder / "a")[1]
+    shuffled = dougong.read(folder / "one.laz")
+    order = np.random.default_rng(0).permutation(len(shuffled))
+    dougong.write(shuffled.select(order), folder / "other.laz")
+    second = run(capsys, "--lidar", folder / "other.laz", "--out", folder / "b")[1]
+    assert second["result_hash"] == first["result_hash"]
+    third = run(capsys, "--lidar", folder / "two.laz", "--out", folder / "c")[1]
+    assert third["result_hash"] != first["result_hash"]
+
+
+def test_a_failing_job_leaves_nothing(folder, capsys, monkeypatch):
+    def broken(*args, **kwargs):
+        raise dougong.RegistrationError("no overlap at all.")
+
+    monkeypatch.setattr("dougong.pipeline.run.register", broken)
+    code, document = run(capsys, clouds(folder), "--out", folder / "out")
+    assert (code, document["error"]["type"]) == (1, "RegistrationError")
+    assert not (folder / "out").exists()
+    assert [path for path in folder.iterdir() if "part" in path.name] == []
+
+
+@pytest.mark.parametrize(
+    ("tokens", "said"),
+    [
+        (("--lidar", "gone.laz"), "no file matches"),
+        ((), "no cloud is named"),
+        (("project.toml", "--lidar", "one.laz"), "Pass one or the other"),
+        (("--lidar", "one.laz", "--photogrammetry", "one.laz"), "two clouds are called 'one'"),
+        (("--lidar", "one.laz", "--memory", "200MB"), "more than --memory"),
+    ],
+)
+def test_a_job_that_cannot_be_meant_exits_2(folder, tokens, said, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    code, document = run(capsys, *tokens, "--out", "out")
+    assert code == 2
+    assert said in document["error"]["message"]
+    assert not (folder / "out").exists()

@@ -1,0 +1,103 @@
+"""The top of registration: file coordinates, units, refusals, and the document's layout."""
+
+import json
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+import dougong
+from dougong.cloud import Cloud, Frame
+from dougong.errors import FrameError
+from dougong.registration import Register, register, registration_to_json
+from dougong.registration.pair import to_file_transform
+
+
+def rigid(seed):
+    T = np.eye(4)
+    T[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    T[:3, 3] = np.random.default_rng(seed).normal(0, 50, 3)
+    return T
+
+
+def test_file_transform_takes_file_points_to_file_points():
+    foot = 0.3048
+    source = Frame(origin=np.array([100.0, 200.0, 5.0]), unit_m=(foot, foot, foot))
+    target = Frame(origin=np.array([5e5, 4e6, 300.0]))
+    T = rigid(1)
+    points = np.random.default_rng(2).normal(0, 30, (20, 3))
+    file_source = source.to_file(points)
+    expected = target.to_file(points @ T[:3, :3].T + T[:3, 3])
+    M = to_file_transform(T, source, target)
+    np.testing.assert_allclose(file_source @ M[:3, :3].T + M[:3, 3], expected, atol=1e-8)
+    assert np.cbrt(np.linalg.det(M[:3, :3])) == pytest.approx(foot)
+
+
+def test_heights_in_another_unit_are_refused():
+    points = np.random.default_rng(3).uniform(0, 10, (500, 3))
+    cloud = Cloud.from_points(points)
+    odd = Cloud(xyz=cloud.xyz, records=cloud.records, frame=Frame(unit_m=(1.0, 1.0, 0.3048)))
+    with pytest.raises(FrameError, match=r"heights in units of 0\.3048 m"):
+        register(odd, cloud)
+
+
+@pytest.mark.parametrize(("field", "value"), [("dof", 7), ("dof", "5")])
+def test_what_is_not_built_is_named(field, value):
+    with pytest.raises(ValidationError, match="not built yet"):
+        Register(**{field: value})
+
+
+def test_dof_may_be_text():
+    assert Register(dof="6").dof == 6
+
+
+def test_millimetres_are_refused_in_one_sentence():
+    points = np.random.default_rng(4).uniform(0, 20, (3000, 3))
+    result = register(Cloud.from_points(points), Cloud.from_points(1000.0 * points))
+    assert result.status == "failed"
+    assert result.matrix is None
+    assert "millimetres" in result.reason
+
+
+def test_document_has_the_contract_layout():
+    points = np.random.default_rng(5).uniform(0, 20, (3000, 3))
+    target = Cloud.from_points(1000.0 * points)
+    result = register(Cloud.from_points(points), target)
+    document = registration_to_json(
+        result, source="a.laz", target="b.laz", target_frame=target.frame
+    )
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    assert set(document) >= {
+        *("status", "source", "target", "matrix", "scale", "dof", "coarse", "probability"),
+        *("reason", "fine", "covariance", "covariance_about", "unobservable", "checks"),
+        *("seconds", "dougong", "parameters", "inputs"),
+    }
+    assert set(document["coarse"]) == {"method", "hypotheses", "margin"}
+    assert document["dougong"] == dougong.__version__
+
+
+@pytest.mark.data
+def test_street_pair_against_its_truth(data):
+    folder = data / "street_pair"
+
+    def cloud(name):
+        vertex = PlyData.read(folder / f"{name}.ply")["vertex"]
+        return Cloud.from_points(np.column_stack([vertex[k] for k in "xyz"]).astype(float))
+
+    truth = np.loadtxt(folder / "T_target_source.txt")
+    source, target = cloud("source"), cloud("target")
+    result = register(source, target, Register(dof=6), target_kind="lidar")
+    assert result.status == "ok"
+    # Rings 0.2 m apart: sure of the pose, and plain about how closely it is held.
+    assert "agree about it to" in result.reason
+    turn = result.matrix[:3, :3] @ truth[:3, :3].T
+    assert np.degrees(Rotation.from_matrix(turn).magnitude()) < 0.5
+    assert np.linalg.norm(result.matrix[:3, 3] - truth[:3, 3]) < 0.1
+    document = registration_to_json(
+        result, source="s", target="t", target_frame=target.frame, inputs=[{"points": 1}]
+    )
+    assert len(document["covariance"]) == 6
+    np.testing.assert_allclose(document["matrix"], result.matrix)
+    assert document["fine"]["fitness"] > 0.3

@@ -1,0 +1,201 @@
+"""The proof: what cannot be told apart is said, and a wrong pose is never called ok."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dougong.registration.evidence import hear, sharpness, summon, support
+from dougong.registration.handedness import handedness
+from dougong.registration.icp import Icp, build_levels
+from dougong.registration.pair import Register, decide
+from dougong.registration.prepare import Prepared
+from dougong.registration.result import Hypothesis
+from dougong.registration.rivals import is_same
+from dougong.registration.sanity import mirrored
+from dougong.registration.verdict import Verdict, compare
+
+SPACING = 0.25
+
+
+def rectangle(rng, corner, u, v, normal):
+    """Points of a parallelogram, one per SPACING squared."""
+    u, v = np.array(u, dtype=float), np.array(v, dtype=float)
+    count = int(np.linalg.norm(np.cross(u, v)) / SPACING**2)
+    at = np.array(corner) + rng.random((count, 1)) * u + rng.random((count, 1)) * v
+    return at, np.tile(normal, (count, 1)).astype(float)
+
+
+def house(rng, x, y, length, width, height):
+    """Four walls and a flat roof."""
+    a, b = x + length, y + width
+    return [
+        rectangle(rng, (x, y, 0), (length, 0, 0), (0, 0, height), (0, -1, 0)),
+        rectangle(rng, (x, b, 0), (length, 0, 0), (0, 0, height), (0, 1, 0)),
+        rectangle(rng, (x, y, 0), (0, width, 0), (0, 0, height), (-1, 0, 0)),
+        rectangle(rng, (a, y, 0), (0, width, 0), (0, 0, height), (1, 0, 0)),
+        rectangle(rng, (x, y, height), (length, 0, 0), (0, width, 0), (0, 0, 1)),
+    ]
+
+
+def site(seed, *houses, sigma=0.005, kind="lidar"):
+    rng = np.random.default_rng(seed)
+    parts = [rectangle(rng, (-25, -25, 0), (50, 0, 0), (0, 50, 0), (0, 0, 1))]
+    for numbers in houses:
+        parts += house(rng, *numbers)
+    xyz = np.concatenate([p for p, _ in parts]) + sigma * rng.normal(
+        size=(sum(len(p) for p, _ in parts), 3)
+    )
+    normals = np.concatenate([n for _, n in parts])
+    return Prepared(
+        xyz=xyz,
+        normals=normals,
+        normal_is_oriented=False,
+        planarity=np.full(len(xyz), 0.99),
+        is_ground=np.arange(len(xyz)) < len(parts[0][0]),
+        height_above_ground=xyz[:, 2],
+        weights_area=np.full(len(xyz), SPACING**2),
+        spacing_m=SPACING,
+        sigma_m=sigma,
+        kind=kind,
+    )
+
+
+def turned(deg, shift=(0.0, 0.0, 0.0)):
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", deg, degrees=True).as_matrix()
+    T[:3, 3] = shift
+    return T
+
+
+def starts(*poses):
+    return [Hypothesis(T_target_source=T, score=0.5, method="given") for T in poses]
+
+
+SYMMETRIC = ((-6.0, -4.0, 12.0, 8.0, 5.0),)
+UNLIKE = ((-6.0, -4.0, 12.0, 8.0, 5.0), (10.0, 6.0, 5.0, 4.0, 3.0), (-18.0, 8.0, 4.0, 9.0, 6.0))
+
+
+def test_a_site_that_is_unlike_itself_is_ok_and_right():
+    found = decide(
+        site(0, *UNLIKE),
+        site(1, *UNLIKE),
+        starts(turned(180.0), turned(1.0, (0.2, -0.1, 0.1))),
+        Register(),
+    )
+    assert found.status == "ok"
+    assert is_same(found.T, np.eye(4), np.zeros(3))
+    assert np.linalg.norm(found.T[:3, 3]) < 0.01
+    assert found.probability > 0.9
+
+
+def test_a_lone_symmetric_house_is_ambiguous_though_one_start_was_given():
+    found = decide(site(2, *SYMMETRIC), site(3, *SYMMETRIC), starts(turned(0.5)), Register())
+    assert found.status == "ambiguous"
+    listed = [found.T, *(c.T for c in found.ruling.undecided)]
+    for angle in (0.0, 180.0):
+        assert any(is_same(T, turned(angle), np.zeros(3)) for T in listed)
+    assert found.probability <= 0.5
+    assert "yaw hint" in found.reason
+
+
+def test_a_yaw_hint_decides_a_symmetric_house():
+    found = decide(
+        site(2, *SYMMETRIC), site(3, *SYMMETRIC), starts(turned(0.5)), Register(yaw_hint_deg=0.0)
+    )
+    assert found.status == "ok"
+
+
+def test_two_different_places_are_never_ok():
+    other = ((-10.0, -12.0, 5.0, 14.0, 7.0), (4.0, -3.0, 9.0, 3.0, 4.0))
+    poses = [turned(angle, (0.3, 0.2, 0.0)) for angle in (0, 45, 90, 180, 270)]
+    found = decide(site(4, *UNLIKE), site(5, *other), starts(*poses), Register())
+    assert found.status != "ok"
+
+
+def test_a_lone_wall_slides():
+    wall = ((-20.0, 0.0, 40.0, 0.3, 4.0),)
+
+    # The ends of the wall, which would stop it, are cut off.
+    def cut(cloud):
+        keep = np.abs(cloud.xyz[:, 0]) < 15.0
+        return Prepared(
+            xyz=cloud.xyz[keep],
+            normals=cloud.normals[keep],
+            normal_is_oriented=False,
+            planarity=cloud.planarity[keep],
+            is_ground=cloud.is_ground[keep],
+            height_above_ground=cloud.height_above_ground[keep],
+            weights_area=cloud.weights_area[keep],
+            spacing_m=SPACING,
+            sigma_m=cloud.sigma_m,
+            kind="lidar",
+        )
+
+    found = decide(cut(site(6, *wall)), cut(site(7, *wall)), starts(np.eye(4)), Register())
+    assert found.status != "ok"
+
+
+def test_no_start_is_a_failure_in_words():
+    found = decide(site(8, *UNLIKE), site(9, *UNLIKE), [], Register())
+    assert found.status == "failed"
+    assert found.T is None
+    assert "found no pose" in found.reason
+
+
+def test_comparison_is_antisymmetric_and_prefers_the_truth():
+    court = summon(site(10, *UNLIKE), site(11, *UNLIKE))
+    right, wrong = hear(court, np.eye(4)), hear(court, turned(180.0))
+    forward = compare(court, right, wrong, 5.0)
+    assert forward.gain > 0.1
+    assert forward.p_value < 1e-2
+    assert compare(court, wrong, right, 5.0).gain == pytest.approx(-forward.gain)
+    assert compare(court, right, right, 5.0).p_value == 1.0
+
+
+def test_only_the_true_pose_is_sharp():
+    court = summon(site(12, *UNLIKE), site(13, *UNLIKE))
+    right, wrong = hear(court, np.eye(4)), hear(court, turned(40.0, (3.0, 0.0, 1.7)))
+    assert sharpness(court, right) > 2.0 > sharpness(court, wrong)
+    assert support(court, right) > 0.95
+    assert right.total < wrong.total
+
+
+# A house and its wing equal their mirror image; the barn beside them does not.
+HOUSE = ((-6.0, -4.0, 12.0, 8.0, 5.0), (-3.0, -15.0, 6.0, 11.0, 4.0))
+BARN = (10.0, 3.0, 8.0, 6.0, 5.0)
+
+
+@pytest.mark.parametrize("has_barn", [True, False])
+def test_the_mirror_image_of_a_symmetric_house_is_heard(has_barn):
+    houses = (*HOUSE, BARN) if has_barn else HOUSE
+    source, target = site(8, *houses), site(9, *houses)
+    plain = decide(source, target, starts(turned(0.5)), Register())
+    assert plain.status == "ok", plain.reason
+    assert np.linalg.norm(plain.T[:3, 3]) < 0.01
+    assert ("mirror image fits as well" in plain.reason) is not has_barn
+    left = mirrored(source)
+    if not has_barn:
+        assert (
+            "mirror image fits as well"
+            in decide(left, target, starts(turned(0.5)), Register()).reason
+        )
+        return
+    # The house alone would carry the pose; what its mirror image explains as well gives it away.
+    icp = Icp(levels=2, first_distance_m=1.5, last_distance_m=0.5, points_per_level=3000)
+    court, levels = summon(left, target), build_levels(left, target, icp)
+    winner = hear(court, np.eye(4))
+    assert handedness(court, levels, winner, icp, Register().verdict) == "left"
+
+
+def test_blocks_that_disagree_about_the_pose_are_not_ok():
+    strict = Register(verdict=Verdict(most_spread_m=0.001))
+    found = decide(site(8, *UNLIKE), site(9, *UNLIKE), starts(turned(0.5)), strict)
+    assert found.status == "ambiguous"
+    assert "disagree about the pose" in found.reason
+
+
+def test_what_the_proof_refuses_is_not_fitted():
+    other = ((-10.0, -12.0, 5.0, 14.0, 7.0), (4.0, -3.0, 9.0, 3.0, 4.0))
+    found = decide(site(4, *UNLIKE), site(5, *other), starts(turned(30.0)), Register())
+    assert found.status == "failed"
+    assert found.fine is None
