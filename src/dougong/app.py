@@ -189,6 +189,7 @@ def register_files(
     overwrite: bool,
     memory_bytes: int | None,
     progress: Progress,
+    pairs: Path | None = None,
 ) -> Document:
     """Register one file onto another and write registration.json and report.html into `out`.
 
@@ -200,6 +201,8 @@ def register_files(
         Fields of `Register`.
     source_kind, target_kind : optional
         The sensors; guessed from the files where they are not given.
+    pairs : Path, optional
+        A CSV file of places picked in both clouds.
     """
     from dougong.pipeline import jobs
     from dougong.pipeline.outputs import refuse_existing, result_folder
@@ -217,6 +220,7 @@ def register_files(
             target_kind=target_kind,
             memory_bytes=memory_bytes,
             progress=progress,
+            pairs=pairs,
         )
         _build_report(part, progress)
     return document

@@ -82,7 +82,18 @@ def registration(document: Mapping[str, Any]) -> str:
         f"probability {document['probability']:.3f}, {document['dof']} degrees of freedom"
     )
     lines += [f"  not observable: {direction['text']}" for direction in document["unobservable"]]
+    if document.get("pairs"):
+        lines.append(_pairs(document["pairs"]))
     return "\n".join(lines)
+
+
+def _pairs(document: Mapping[str, Any]) -> str:
+    """Return what the pose leaves of each picked pair (or their own best fit, without a pose)."""
+    rows = document["pairs"]
+    is_posed = all(row["residual_m"] is not None for row in rows)
+    key = "residual_m" if is_posed else "fit_residual_m"
+    off = ", ".join(f"{row['name']} {millimetres(row[key])}" for row in rows)
+    return f"  picked pairs, {'under this pose' if is_posed else 'under their own best fit'}: {off}"
 
 
 def notes(document: Sequence[str]) -> str:

@@ -26,6 +26,7 @@ def command(
     dof: Literal["auto", "4", "6"] = "auto",
     filtered: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     yaw_hint: float | None = None,
+    pairs: Path | None = None,
     accept_best: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     common: Common = DEFAULT,
@@ -60,6 +61,9 @@ def command(
         The inputs are clean already; nothing is dropped as noise.
     yaw_hint
         About how far SOURCE is turned about the vertical, degrees: picks among equal poses.
+    pairs
+        Places picked in both clouds with `dougong view SOURCE TARGET --pairs FILE`: their pose is
+        one more for the proof to hear, and never ok by itself.
     accept_best
         Exit with 0 and take the best pose where several are possible; the status stays.
     overwrite
@@ -84,6 +88,7 @@ def command(
             overwrite=overwrite,
             memory_bytes=common.memory_bytes(),
             progress=progress,
+            pairs=pairs,
         )
         code = _EXIT[document["status"]]
         if accept_best and code == UNSURE:

@@ -15,6 +15,7 @@ from dougong.pipeline.guess import guess_kind
 from dougong.pipeline.marking import GROUND_CLASS, marked, with_classes
 from dougong.pipeline.memory import refuse_too_large
 from dougong.pipeline.outputs import refuse_existing, watched, write_json
+from dougong.pipeline.pairs import read_pairs
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import stem
 from dougong.pipeline.provenance import Clock, peak_memory_bytes, sha256, software
@@ -259,17 +260,20 @@ def register_files(
     target_kind: Kind | None,
     memory_bytes: int | None,
     progress: Progress,
+    pairs: Path | None = None,
 ) -> dict[str, Any]:
     """Register one file onto another; write ``registration.json`` into the folder `out`.
 
     Raises
     ------
     InputError
-        A setting is wrong, or the job needs more memory than it may use.
+        A setting or the file of picked pairs is wrong, or the job needs more memory than it may
+        use.
     FormatError, FrameError, RegistrationError
         The clouds cannot be read or combined.
     """
     params = validated(Register, options, "register")
+    picked = None if pairs is None else read_pairs(pairs, stem(source))
     refuse_too_large([source, target], memory_bytes)
     clouds: list[Cloud] = []
     kinds: list[Kind] = []
@@ -286,7 +290,9 @@ def register_files(
         inputs.append({"path": str(path), "sha256": sha256(path), "points": len(cloud)})
         notes += [f"{path.name}: {note}" for note in (*cloud.notes, *faults_of(cloud))]
     progress.stage(f"registering {source.name} onto {target.name}")
-    result = register(clouds[0], clouds[1], params, source_kind=kinds[0], target_kind=kinds[1])
+    result = register(
+        clouds[0], clouds[1], params, source_kind=kinds[0], target_kind=kinds[1], pairs=picked
+    )
     document = to_document(
         replace(result, notes=(*notes, *result.notes)),
         source=clouds[0].name,

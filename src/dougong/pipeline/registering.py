@@ -9,6 +9,7 @@ from dougong.formats import is_same_crs, require_metric, units_of
 from dougong.formats.faults import coordinate_hashes
 from dougong.registration import Register
 from dougong.registration import register as search
+from dougong.registration.picked_pairs import PickedPairs
 from dougong.registration.result import Registration
 from dougong.typing import Kind
 
@@ -20,6 +21,7 @@ def register(
     *,
     source_kind: Kind = "lidar",
     target_kind: Kind = "photogrammetry",
+    pairs: PickedPairs | None = None,
 ) -> Registration:
     """Find the motion from `source`'s file coordinates to `target`'s, and say how sure it is.
 
@@ -30,6 +32,8 @@ def register(
     params : Register, optional
     source_kind, target_kind : {"lidar", "photogrammetry"}
         What a sensor can and cannot see decides what counts as a contradiction.
+    pairs : PickedPairs, optional
+        Places picked in both clouds, in file coordinates: one more pose for the proof to hear.
 
     Returns
     -------
@@ -55,6 +59,7 @@ def register(
         params,
         source_kind=source_kind,
         target_kind=target_kind,
+        pairs=pairs,
     )
     return replace(result, notes=(*different_systems(source, target), *result.notes))
 

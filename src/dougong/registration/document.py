@@ -70,6 +70,7 @@ def registration_to_json(
         ),
         "unobservable": [dict(item) for item in fine.unobservable] if fine is not None else [],
         "checks": None if checks is None else dict(checks),
+        "pairs": None if result.pairs is None else dict(result.pairs),
         "notes": list(result.notes),
         "seconds": dict(result.seconds),
         "dougong": dougong.__version__,

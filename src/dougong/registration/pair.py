@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -21,6 +21,16 @@ from dougong.registration.evidence import Court, hear, summon
 from dougong.registration.handedness import LEFT_SENTENCE, handedness
 from dougong.registration.icp import Icp, build_levels, refine
 from dougong.registration.overlap import apply
+from dougong.registration.picked_pairs import (
+    PairFit,
+    PickedPairs,
+    fit_pairs,
+    from_levelled,
+    levelled_source,
+    starts_of,
+    weigh,
+    with_pairs,
+)
 from dougong.registration.plan_search import PlanSearch, plan_search
 from dougong.registration.prepare import Prepare, Prepared, prepare
 from dougong.registration.principal_axes import improved_pca, traditional_pca
@@ -91,6 +101,7 @@ def register(
     *,
     source_kind: Kind = "lidar",
     target_kind: Kind = "photogrammetry",
+    pairs: PickedPairs | None = None,
 ) -> Registration:
     """Find the motion from `source`'s file coordinates to `target`'s, and say how sure it is.
 
@@ -101,6 +112,8 @@ def register(
     params : Register, optional
     source_kind, target_kind : {"lidar", "photogrammetry"}
         What a sensor can and cannot see decides what counts as a contradiction.
+    pairs : PickedPairs, optional
+        Places that a person picked in both: their pose is heard beside those of the search.
 
     Returns
     -------
@@ -111,6 +124,8 @@ def register(
     ------
     FrameError
         Heights and plan of a file have different units.
+    InputError
+        The pairs fix no pose, or do not belong to these clouds.
     RegistrationError
         A cloud has too few points, or is not levelled.
 
@@ -120,6 +135,14 @@ def register(
     """
     params = params or Register()
     clock = _Clock()
+    fit = None if pairs is None else fit_pairs(pairs, source, target)
+    level = None if fit is None else levelled_source(source, fit)
+    if fit is not None and level is not None:
+        cloud, own, matrix = level
+        straight = register(
+            cloud, target, params, source_kind=source_kind, target_kind=target_kind, pairs=own
+        )
+        return from_levelled(straight, fit, matrix, source.name)
     scale = _unit_of(source) / _unit_of(target)
     proposal = propose_scale(source, target)
     if proposal is not None:
@@ -132,7 +155,10 @@ def register(
         *(f"{target.name}: {n}" for n in two.notes),
     ]
     clock.lap("prepare")
-    starts = coarse_poses(one, two, source.frame, target.frame, params)
+    picked = [] if fit is None else _picked(fit, one, two)
+    is_searched = fit is None or params.coarse != "none"
+    starts = coarse_poses(one, two, source.frame, target.frame, params) if is_searched else []
+    starts = [*picked, *starts]
     clock.lap("coarse")
     found = decide(one, two, starts, params, clock)
     is_judged = found.status == "ok" or found.reason == LEFT_SENTENCE
@@ -141,7 +167,18 @@ def register(
         mirror = is_mirrored(one, two, starts, params.plan)
         found = _refused(mirror.sentence) if mirror.is_mirrored else found
         clock.lap("mirror check")
-    return _in_file_coordinates(found, source, target, scale, params, clock, notes)
+    if fit is not None:
+        status, reason = weigh(found.status, found.reason, found.T, fit, found.ruling)
+        found = replace(found, status=status, reason=reason)
+    result = _in_file_coordinates(found, source, target, scale, params, clock, notes)
+    return result if fit is None else with_pairs(result, fit)
+
+
+def _picked(fit: PairFit, source: Prepared, target: Prepared) -> list[Hypothesis]:
+    return [
+        Hypothesis(T_target_source=T, score=ranking.score(T, source, target), method="pairs")
+        for T in starts_of(fit)
+    ]
 
 
 def coarse_poses(

@@ -77,3 +77,5 @@ class Registration:
     notes: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    pairs: Mapping[str, Any] | None = None
+    """What the picked pairs said (`picked_pairs.pairs_document`); None: there were none."""

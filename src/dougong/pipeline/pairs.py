@@ -1,0 +1,93 @@
+"""Picked pairs as a CSV file: the columns of a control file, one row per place."""
+
+import csv
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+
+from dougong.errors import InputError
+from dougong.pipeline.provenance import sha256
+from dougong.registration.picked_pairs import PickedPairs
+
+COORDINATES = ("source_x", "source_y", "source_z", "target_x", "target_y", "target_z")
+HEADER = ("name", "cloud", *COORDINATES, "sigma_m", "role")
+"""The header of control files: `cloud` is the source, `role` is control (used) or check (not)."""
+
+
+def read_pairs(path: Path, source: str) -> PickedPairs:
+    """Read the pairs of one source cloud.
+
+    Parameters
+    ----------
+    path : Path
+        A CSV file with the six columns `COORDINATES`; `name`, `cloud` and `role` are optional.
+    source : str
+        The source's name: rows of other clouds are left out, as are rows of role check.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, a column is missing, a value is no number, or no row is left.
+    """
+    rows = _rows(path)
+    of_cloud = [row for row in rows if (row.get("cloud") or source) == source]
+    if rows and not of_cloud:
+        others = ", ".join(sorted({str(row.get("cloud")) for row in rows}))
+        msg = (
+            f"{path.name} has no pair of {source}: its column cloud names {others}. Give the "
+            "clouds in the order in which they were picked, or leave the column empty."
+        )
+        raise InputError(msg)
+    used = [row for row in of_cloud if (row.get("role") or "control").strip().lower() != "check"]
+    values = np.array([_numbers(path, number, row) for number, row in enumerate(used, 2)])
+    values = values.reshape(-1, 6)
+    return PickedPairs(
+        names=tuple((row.get("name") or str(index)) for index, row in enumerate(used, 1)),
+        source=values[:, :3],
+        target=values[:, 3:],
+        where=path.name,
+        record={"file": str(path), "sha256": sha256(path)},
+    )
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        msg = f"there is no file {path}. `dougong view SOURCE TARGET --pairs FILE` writes one."
+        raise InputError(msg) from None
+    except (OSError, UnicodeDecodeError) as error:
+        msg = f"{path} cannot be read as text ({error}). Give a CSV file in UTF-8."
+        raise InputError(msg) from None
+    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+    named = [name.strip().lower() for name in reader.fieldnames or ()]
+    reader.fieldnames = named
+    missing = [name for name in COORDINATES if name not in named]
+    if missing:
+        msg = (
+            f"{path.name} has no column {', '.join(missing)}; its first line is "
+            f"{','.join(named)[:80]!r}. Expected: {','.join(HEADER)} (name, cloud, sigma_m and "
+            "role may be left out), separated by commas."
+        )
+        raise InputError(msg)
+    return [row for row in reader if any((value or "").strip() for value in row.values())]
+
+
+def _numbers(path: Path, number: int, row: dict[str, str]) -> list[float]:
+    found = []
+    for name in COORDINATES:
+        text = (row.get(name) or "").strip()
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            msg = (
+                f"{path.name}, pair {row.get('name') or number - 1}: {name} is {text!r}; a number "
+                "with a decimal point is expected."
+            )
+            raise InputError(msg)
+        found.append(value)
+    return found
