@@ -195,7 +195,10 @@ def test_a_source_that_lies_on_its_side_is_levelled_by_the_pairs(clouds, run):
     assert np.abs(result.hypotheses[0].T_target_source - result.matrix).max() < 1e-9
 
 
-def write(path, rows, header=",".join(HEADER)):
+COLUMNS = ",".join(HEADER)
+
+
+def write(path, rows, header=COLUMNS):
     path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
     return path
 
@@ -216,9 +219,9 @@ def test_the_file_is_a_control_file(tmp_path):
 @pytest.mark.parametrize(
     ("rows", "header", "said"),
     [
-        (["a,scan,1,2,x,4,5,6,,"], ",".join(HEADER), "pair a: source_z is 'x'; a number"),
-        (["a,scan,1,2,nan,4,5,6,,"], ",".join(HEADER), "source_z is 'nan'"),
-        (["a,hall,1,2,3,4,5,6,,"], ",".join(HEADER), "no pair of scan.*names hall"),
+        (["a,scan,1,2,x,4,5,6,,"], COLUMNS, "pair a: source_z is 'x'; a number"),
+        (["a,scan,1,2,nan,4,5,6,,"], COLUMNS, "source_z is 'nan'"),
+        (["a,hall,1,2,3,4,5,6,,"], COLUMNS, "no pair of scan.*names hall"),
         (["1;2;3"], "x;y;z", "no column source_x.*'x;y;z'.*separated by commas"),
     ],
 )
