@@ -4,10 +4,13 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 import dougong
 from dougong.cli import call
 from dougong.cloud import Cloud
+from dougong.filters.selection import Reason
+from dougong.pipeline.removed import removed_sample
 from dougong.registration.result import Hypothesis, Registration
 
 SHIFT = np.array([3.0, -2.0, 0.5])
@@ -110,6 +113,36 @@ def test_stations_that_are_not_registered_move_by_themselves(folder, capsys, mon
     page = (folder / "out" / "report.html").read_text(encoding="utf-8")
     assert "1 of 2 clouds were registered" in page
     assert "holds only: scans-1, map" in page
+
+
+def test_what_was_removed_is_kept_to_be_looked_at(folder, capsys, monkeypatch):
+    """Thirty points in the air, and where the reference has them once the scan has moved."""
+    strays = np.random.default_rng(7).uniform([0, 0, 5], [10, 10, 12], (30, 3))
+    dougong.write(Cloud.from_points(np.vstack([cloud(0).xyz, strays])), folder / "one.laz")
+    monkeypatch.setattr("dougong.pipeline.run.register", answer("ok"))
+    tokens = ("--lidar", folder / "one.laz", "--photogrammetry", folder / "map.laz")
+    _, result = run(capsys, *tokens, "--out", folder / "out")
+    one = result["clouds"][0]
+    taken = {name: count for name, count in one["reasons"].items()
+             if name not in ("kept", "decimated")}  # fmt: skip
+    removed = dougong.read(folder / "out" / "removed" / "one.laz")
+    assert len(removed) == one["removed_shown"] == sum(taken.values()) > 0
+    codes = removed.attribute("dougong_reason")
+    assert {Reason(code).name.lower(): int((codes == code).sum()) for code in set(codes)} == taken
+    shown = removed.frame.to_file(removed.xyz)
+    near, _ = cKDTree(shown).query(strays + SHIFT)
+    assert (near < 0.002).sum() >= 20
+
+
+def test_the_removed_points_that_are_kept_do_not_depend_on_the_order():
+    points = np.random.default_rng(8).uniform(0, 9, (500, 3))
+    codes = np.random.default_rng(9).integers(0, 5, 500).astype(np.uint8)
+    order = np.random.default_rng(10).permutation(500)
+    one = removed_sample(Cloud.from_points(points), codes, 40)
+    two = removed_sample(Cloud.from_points(points[order]), codes[order], 40)
+    assert len(one) == len(two) == 40
+    assert set(map(tuple, one.xyz)) == set(map(tuple, two.xyz))
+    assert set(one.attribute("dougong_reason")) <= {2, 3, 4}
 
 
 @pytest.mark.parametrize("status", ["ambiguous", "failed"])

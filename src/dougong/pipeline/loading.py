@@ -14,6 +14,7 @@ from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Entry, files_of
 from dougong.pipeline.provenance import Clock, sha256
 from dougong.pipeline.recipes import Recipe, filter_cloud
+from dougong.pipeline.removed import removed_sample
 from dougong.pipeline.steps import Filtered
 from dougong.pipeline.store import Store
 from dougong.typing import Kind
@@ -28,6 +29,8 @@ class Source:
     filtered: Filtered
     points_in: int
     notes: tuple[str, ...]
+    removed: Cloud
+    """A sample of what the filters took out, see `removed_sample`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,6 +135,7 @@ class Loader:
                 station=station_of,
                 filtered=filtered,
                 points_in=len(cloud),
+                removed=removed_sample(cloud, filtered.codes),
                 notes=(
                     *(f"{file.name}: {note}" for note in (*cloud.notes, *faults)),
                     *filtered.notes,

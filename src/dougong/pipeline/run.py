@@ -25,6 +25,7 @@ from dougong.registration import Register
 from dougong.registration.result import Registration
 
 MERGED = "merged.copc.laz"
+REMOVED = "removed"
 _WORST = ("failed", "ambiguous", "ok")
 
 
@@ -44,12 +45,12 @@ class Linked:
             return True
         return self.accepts_best and self.result.matrix is not None
 
-    def in_reference(self, reference: Cloud) -> list[Cloud]:
-        """Return its clouds in the reference's frame; where that is not known, in their own."""
+    def in_reference(self, clouds: list[Cloud], reference: Cloud) -> list[Cloud]:
+        """Return its `clouds` in the reference's frame; where that is not known, in their own."""
         if self.result is None or not self.is_sure or self.result.matrix is None:
-            return self.mover.clouds
+            return clouds
         matrix, frame = self.result.matrix, reference.frame
-        return [cloud.moved(matrix, frame) for cloud in self.mover.clouds]
+        return [cloud.moved(matrix, frame) for cloud in clouds]
 
 
 def run(
@@ -69,7 +70,7 @@ def run(
     folder : Path
         What the project's paths are relative to.
     out : Path
-        Gets merged.copc.laz, clouds/, registrations/ and result.json.
+        Gets merged.copc.laz, clouds/, removed/, registrations/ and result.json.
     store : Store
         Keeps finished filter steps.
     progress : Progress
@@ -176,18 +177,17 @@ def _write_clouds(
     linked: Sequence[Linked], reference: Mover, out: Path, progress: Progress
 ) -> dict[str, Any]:
     """Write each filtered cloud and the merged one; return what the merged one holds."""
-    (out / "clouds").mkdir()
     frame_of = reference.clouds[0]
     sure: list[Cloud] = []
     ids: list[int] = []
     for source_id, link in enumerate(linked, 1):
         progress.stage(f"writing clouds/{link.mover.name}.laz")
-        clouds = link.in_reference(frame_of)
-        path = out / "clouds" / f"{link.mover.name}.laz"
-        if len(clouds) == 1:
-            write(clouds[0], path)
-        else:
-            write_merged(clouds, path, source_ids=[source_id] * len(clouds))
+        clouds = link.in_reference(link.mover.clouds, frame_of)
+        _write_one(clouds, out / "clouds" / f"{link.mover.name}.laz", source_id)
+        removed = [source.removed for source in link.mover.sources if len(source.removed)]
+        if removed:
+            placed = link.in_reference(removed, frame_of)
+            _write_one(placed, out / REMOVED / f"{link.mover.name}.laz", source_id)
         if link.is_sure:
             sure += clouds
             ids += [source_id] * len(clouds)
@@ -202,6 +202,14 @@ def _write_clouds(
     }
 
 
+def _write_one(clouds: Sequence[Cloud], path: Path, source_id: int) -> None:
+    path.parent.mkdir(exist_ok=True)
+    if len(clouds) == 1:
+        write(clouds[0], path)
+    else:
+        write_merged(clouds, path, source_ids=[source_id] * len(clouds))
+
+
 def _cloud_document(link: Linked, loader: Loader) -> dict[str, Any]:
     mover = link.mover
     return {
@@ -214,6 +222,7 @@ def _cloud_document(link: Linked, loader: Loader) -> dict[str, Any]:
         "reduction": 1.0 - mover.points_out / mover.points_in,
         "stages": stage_documents(mover),
         "reasons": reason_counts([source.filtered.codes for source in mover.sources]),
+        "removed_shown": sum(len(source.removed) for source in mover.sources),
         "ground_points": int(sum(source.filtered.is_ground.sum() for source in mover.sources)),
     }
 
