@@ -118,7 +118,8 @@ def test_stations_that_are_not_registered_move_by_themselves(folder, capsys, mon
 def test_what_was_removed_is_kept_to_be_looked_at(folder, capsys, monkeypatch):
     """Thirty points in the air, and where the reference has them once the scan has moved."""
     strays = np.random.default_rng(7).uniform([0, 0, 5], [10, 10, 12], (30, 3))
-    dougong.write(Cloud.from_points(np.vstack([cloud(0).xyz, strays])), folder / "one.laz")
+    file = folder / "one.laz"
+    dougong.write(Cloud.from_points(np.vstack([cloud(0).xyz, strays])), file, overwrite=True)
     monkeypatch.setattr("dougong.pipeline.run.register", answer("ok"))
     tokens = ("--lidar", folder / "one.laz", "--photogrammetry", folder / "map.laz")
     _, result = run(capsys, *tokens, "--out", folder / "out")
