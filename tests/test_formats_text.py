@@ -1,12 +1,14 @@
 """Text: every common layout, odd lines counted, exact numbers."""
 
+import weakref
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dougong.errors import FormatError
-from dougong.formats import check, describe, iterate, read
+from dougong.formats import check, describe, iterate, read, text_rows
 
 
 def save(tmp_path, text, name="a.xyz"):
@@ -40,6 +42,7 @@ LAYOUTS = {
     "quoted header": '"x","y","z"\n1.5,2.25,3.125\n-4,5.5,6.75\n7,8,9\n',
     "exponents": "1.5e0 2.25E+0 31.25e-1\n-4 5.5 6.75\n7 8 9\n",
     "count line": "3\n1.5 2.25 3.125\n-4 5.5 6.75\n7 8 9\n",
+    "old line ends": "1.5 2.25 3.125\r-4 5.5 6.75\r7 8 9\r",
     "two blocks": "2\n1.5 2.25 3.125\n-4 5.5 6.75\n1\n7 8 9\n",
 }
 
@@ -90,6 +93,68 @@ def test_meaning_of_columns_without_a_header_is_guessed_and_said(tmp_path, rows,
         assert cloud.attribute(name).tolist() == expected[:, index].tolist()
 
 
+@pytest.mark.parametrize("first", ["", "2\n"])
+def test_the_fourth_of_seven_pts_columns_is_the_intensity(tmp_path, first):
+    """Even where its values could be a colour's."""
+    path = save(tmp_path, f"{first}1 2 3 100 10 20 30\n4 5 6 90 11 21 31\n", "a.pts")
+    cloud = read(path)
+    assert list(cloud.attributes) == ["x", "y", "z", "intensity", "red", "green", "blue"]
+    assert cloud.attribute("intensity").tolist() == [100, 90]
+
+
+@pytest.mark.parametrize(
+    ("lines", "names"),
+    [
+        (["id,easting,northing,height,name"], ["id", "x", "y", "z"]),
+        ([], ["x", "y", "z", "intensity"]),
+    ],
+)
+def test_columns_of_words_are_passed_over_and_said(tmp_path, lines, names):
+    rows = [f"{i},{i * 0.5},{i % 7},0.25,P{i} corner" for i in range(200)]
+    cloud = read(save(tmp_path, "\n".join([*lines, *rows]), "a.csv"))
+    assert list(cloud.attributes) == names
+    assert len(cloud) == 200
+    assert any("columns of words were not read" in note for note in cloud.notes)
+    assert coordinates(cloud)[3].tolist() == ([1.5, 3, 0.25] if names[0] == "id" else [3, 1.5, 3])
+
+
+def test_words_before_the_numbers(tmp_path):
+    """Point, easting, northing, height, description: how surveyors list points."""
+    rows = [f"P{i},{i}.5,2,3,corner {i}" for i in range(50)]
+    cloud = read(save(tmp_path, "\n".join(rows), "points.csv"))
+    assert coordinates(cloud)[4].tolist() == [4.5, 2, 3]
+    assert cloud.attributes == ("x", "y", "z")
+
+
+def test_most_rows_decide_how_many_columns_there_are(tmp_path):
+    rows = [f"{i} 2 3" + " 7" * (i % 50 == 0) for i in range(1000)]
+    cloud = read(save(tmp_path, "\n".join(rows)))
+    assert len(cloud) == 980
+    assert any("20 of 1000 rows" in note for note in cloud.notes)
+
+
+def test_a_dropped_row_leaves_the_types_of_the_columns(tmp_path):
+    rows = [f"{i} 2 3 {i % 256} 0 255" for i in range(300)]
+    rows[7] = "spoilt"
+    assert read(save(tmp_path, "\n".join(rows))).attribute("red").dtype == np.uint8
+
+
+def test_pyarrow_has_let_go_of_all_it_was_handed(monkeypatch):
+    """What its threads still hold when Python ends aborts the process (exit code 134)."""
+    alive = weakref.WeakSet()
+
+    class Counted(text_rows._WrongLengths):
+        def __init__(self):
+            super().__init__()
+            alive.add(self)
+
+    monkeypatch.setattr(text_rows, "_WrongLengths", Counted)
+    data = b"1 2 3\n4 5 6\n7 8\n" * 2000
+    for _ in range(50):
+        assert len(text_rows.table_of(data, text_rows.RowFormat(3))) == 6000
+        assert not alive
+
+
 def test_whole_numbers_become_integers_large_enough_for_all_rows(tmp_path):
     """The guess is from the first lines; the type from all: row 5000 needs 16 bits."""
     rows = [f"{i} 0 0 10 20 30" for i in range(6000)]
@@ -112,7 +177,8 @@ def test_rows_that_cannot_be_read_are_dropped_and_counted(tmp_path, bad, at):
     path = save(tmp_path, "\n".join(rows) + "\n")
     cloud = read(path)
     assert len(cloud) == 1999
-    assert "1 of 2000 rows had no finite coordinates and were dropped." in cloud.notes
+    lacking = "no finite coordinates or another number of columns"
+    assert f"1 of 2000 rows had {lacking} and were dropped." in cloud.notes
     kept = [i for i in range(2000) if i != at]
     assert sorted(cloud.attribute("x").tolist()) == kept
     assert describe(path).points == 2000
@@ -207,6 +273,11 @@ def test_local_coordinates_do_not_depend_on_the_order_of_points(tmp_path):
         (b"a,b,c\n1,2,3\n", "x, y and z were expected"),
         (b"nan nan nan\nnan nan nan\n", "none of its 2 points"),
         (b"1 2 3\0\0\0", "not text"),
+        ("1 2 3\n".encode("utf-16"), "UTF-16.*Save it as UTF-8"),
+        (
+            b"x;y;z\n1.000,50;1.200,10;3.000,00\n",
+            "after one line comes '1.000,50;1.200,10;3.000,00'",
+        ),
         (b"5\n1 2 3\n4 5 6\n", "count line says 5 points, file ends after 2"),
     ],
 )

@@ -12,7 +12,7 @@ import numpy as np
 from dougong.cloud import BitField, Records
 from dougong.errors import FormatError
 from dougong.formats.stream import Block, opened, refuse_empty, stem_of
-from dougong.formats.text import parse_rows
+from dougong.formats.text_rows import RowFormat, parse_rows
 
 _KINDS = {"F": "f", "U": "u", "I": "i"}
 _RGB = {
@@ -82,7 +82,7 @@ class PcdScan:
     def _ascii(self, rows: int) -> Iterator[Records]:
         widths = [int(np.prod(self.stored[n].shape, dtype=int)) for n in self.stored.names or ()]
         done = 0
-        for table in parse_rows(self.path, self.start, self.count, sum(widths), rows):
+        for table in parse_rows(self.path, self.start, self.count, RowFormat(sum(widths)), rows):
             stored = np.empty(len(table), dtype=self.stored)
             at = 0
             for name, width in zip(self.stored.names or (), widths, strict=True):

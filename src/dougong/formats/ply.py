@@ -17,7 +17,7 @@ import numpy as np
 from dougong.cloud import BitField, Cloud, Records
 from dougong.errors import FormatError
 from dougong.formats.stream import Block, opened, refuse_empty, stem_of
-from dougong.formats.text import parse_rows
+from dougong.formats.text_rows import RowFormat, parse_rows
 from dougong.formats.units import as_wkt, is_same_crs
 
 _TYPES = {
@@ -88,7 +88,7 @@ class PlyScan:
     def _ascii(self, rows: int) -> Iterator[Records]:
         names = self.dtype.names or ()
         done = 0
-        for table in parse_rows(self.path, self.start, self.count, len(names), rows):
+        for table in parse_rows(self.path, self.start, self.count, RowFormat(len(names)), rows):
             records = np.empty(len(table), dtype=self.dtype)
             for column, name in enumerate(names):
                 records[name] = table[:, column]

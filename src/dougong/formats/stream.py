@@ -113,6 +113,8 @@ class Survey:
     rows: int = 0
     not_finite: int = 0
     invalid: int = 0
+    lacking: str = "no finite coordinates"
+    """What a row that is not finite had."""
 
     def add(self, block: Block) -> Mask:
         """Count a block in and return which of its rows are good."""
@@ -142,7 +144,7 @@ class Survey:
         found = []
         if self.not_finite:
             found.append(
-                f"{self.not_finite} of {self.rows} rows had no finite coordinates and were dropped."
+                f"{self.not_finite} of {self.rows} rows had {self.lacking} and were dropped."
             )
         if self.invalid:
             found.append(
@@ -232,9 +234,14 @@ def survey_of(scans: Iterable[Scan], rows: int) -> Survey:
     """Pass over every block of `scans` once."""
     survey = Survey()
     for scan in scans:
+        survey.lacking = _lacking_of(scan)
         for block in scan.blocks(rows):
             survey.add(block)
     return survey
+
+
+def _lacking_of(scan: Scan) -> str:
+    return str(getattr(scan, "lacking", Survey().lacking))
 
 
 def _refuse_no_rows(survey: Survey, path: Path) -> None:
@@ -253,7 +260,7 @@ def read_scans(scans: list[Scan], rows: int) -> list[Cloud]:
     whole = Survey()
     gathered = []
     for scan in scans:
-        mine, room = Survey(), _Room(scan)
+        mine, room = Survey(lacking=_lacking_of(scan)), _Room(scan)
         for block in scan.blocks(rows):
             is_ok = mine.add(block)
             whole.add(block)

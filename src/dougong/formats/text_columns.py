@@ -25,18 +25,6 @@ _RGB = ("red", "green", "blue")
 _NORMAL = ("nx", "ny", "nz")
 
 
-def has_numbers(words: list[str], *, has_decimal_comma: bool) -> bool:
-    """Say whether the first three words of a line are numbers (NaN counts)."""
-    if len(words) < 3:
-        return False
-    try:
-        for word in words[:3]:
-            float(word.replace(",", ".") if has_decimal_comma else word)
-    except ValueError:
-        return False
-    return True
-
-
 def named_columns(words: tuple[str, ...]) -> tuple[str, ...]:
     """Return attribute names from the words of a header line, each once."""
     names: list[str] = []
@@ -62,13 +50,17 @@ def _is_unit(columns: NDArray[np.float64]) -> bool:
     return bool(len(known) and (np.abs(length - 1) < 0.01).mean() > 0.95)
 
 
-def column_names(sample: NDArray[np.float64]) -> tuple[tuple[str, ...], str | None]:
+def column_names(
+    sample: NDArray[np.float64], *, is_pts: bool = False
+) -> tuple[tuple[str, ...], str | None]:
     """Return names for the columns of a headerless file, and in words what was assumed.
 
     Parameters
     ----------
     sample : ndarray, shape (m, k)
         The first rows, k >= 3.
+    is_pts : bool
+        The file is a PTS file, whose fourth column of four or seven is the intensity.
 
     Notes
     -----
@@ -82,7 +74,10 @@ def column_names(sample: NDArray[np.float64]) -> tuple[tuple[str, ...], str | No
     at = 3
     while at < count:
         three = sample[:, at : at + 3]
-        if at + 3 <= count and "red" not in names and _is_whole(three, 255):
+        if is_pts and at == 3 and count in (4, 7):
+            names.append("intensity")
+            at += 1
+        elif at + 3 <= count and "red" not in names and _is_whole(three, 255):
             names += _RGB
             at += 3
         elif at + 3 <= count and "nx" not in names and _is_unit(three):
