@@ -249,6 +249,53 @@ def test_what_was_handled_is_counted_in_words():
     assert "may be millimetres" in " ".join(faults_of(Cloud.from_points(site * 1000)))
 
 
+def test_degrees_and_earth_centred_coordinates_without_a_system_are_doubted(tmp_path):
+    from pyproj import Transformer
+
+    from dougong.formats import faults_of
+
+    rng = np.random.default_rng(0)
+    site = rng.uniform(0, 30, (500, 3)) + [480_700, 2_135_900, 2280]
+    degrees = np.column_stack(
+        Transformer.from_crs("EPSG:32614", "EPSG:4326", always_xy=True).transform(*site.T)
+    )
+    centred = np.column_stack(
+        Transformer.from_crs("EPSG:32614", "EPSG:4978", always_xy=True).transform(*site.T)
+    )
+    north = site + [0, 4_223_000, 0]  # an earth's radius from 0, 0, 0, as a northing may be
+    for name, points, words in (
+        ("degrees", degrees, "may be degrees"),
+        ("centred", centred, "may be earth-centred coordinates"),
+    ):
+        cloud = Cloud.from_points(points)
+        assert words in " ".join(faults_of(cloud))
+        write(cloud, tmp_path / f"{name}.ply")
+        assert any(words in text for text in texts(tmp_path / f"{name}.ply", "warning"))
+    for points in (site, north):
+        assert "may be" not in " ".join(faults_of(Cloud.from_points(points)))
+
+
+def test_a_name_without_or_with_another_suffix_gets_the_right_advice(tmp_path):
+    path = saved(tmp_path, hall(200), ".laz")
+    for name, advice in (("scan", "scan.laz"), ("a.b", "a.laz"), ("a.e57", "a.laz")):
+        (tmp_path / name).write_bytes(path.read_bytes())
+        (text,) = texts(tmp_path / name, "error")
+        assert text.endswith(f"Rename it to {advice}.")
+    (tmp_path / "notes").write_text("1 2 3")
+    assert "has no suffix" in texts(tmp_path / "notes", "error")[0]
+
+
+def test_an_offset_that_is_no_number_is_refused(tmp_path):
+    path = saved(tmp_path, hall(200))
+    raw = bytearray(path.read_bytes())
+    struct.pack_into("<d", raw, 155, float("nan"))
+    path.write_bytes(raw)
+    (text,) = texts(path, "error")
+    assert "has offset [nan" in text
+    with pytest.raises(FormatError, match="must be finite"):
+        describe(path)
+
+
 def test_check_doubts_millimetres_and_does_not_judge_three_points(tmp_path):
     rng = np.random.default_rng(0)
     write(Cloud.from_points(rng.uniform(0, 30_000, (500, 3))), tmp_path / "mm.laz")

@@ -112,7 +112,7 @@ def _of_frame(info: FileInfo) -> list[Finding]:
             f"{name} has no coordinate reference system; its numbers are taken as metres. "
             "That is right for a scanner's own coordinates; otherwise export it with one."
         )
-        return [Finding("warning", text), *_unnamed_degrees(info)]
+        return [Finding("warning", text)]
     problem = metric_problem(info.crs_wkt, info.extent_min, info.extent_max, name)
     if problem:
         return [Finding("error", problem)]
@@ -121,22 +121,6 @@ def _of_frame(info: FileInfo) -> list[Finding]:
             f"{axis} in {unit}" for axis, unit in zip("xyz", info.unit_names, strict=True)
         )
         text = f"{name} is not in metres ({units}); it is converted while reading."
-        return [Finding("warning", text)]
-    return []
-
-
-def _unnamed_degrees(info: FileInfo) -> list[Finding]:
-    """Suspect degrees where x and y could be a place on earth and span next to nothing."""
-    if info.extent_min is None or info.extent_max is None:
-        return []
-    low, high = np.array(info.extent_min), np.array(info.extent_max)
-    is_place = low[0] >= -180 and high[0] <= 180 and low[1] >= -90 and high[1] <= 90
-    span = high - low
-    if is_place and 0 < span[:2].max() < 0.05 and span[2] > 20 * span[:2].max():
-        text = (
-            f"{info.path.name} spans {span[0]:.3g} by {span[1]:.3g} in plan but {span[2]:.3g} in "
-            "height: x and y may be degrees. Reproject it to metres."
-        )
         return [Finding("warning", text)]
     return []
 
@@ -203,11 +187,12 @@ def _of_points(path: Path, info: FileInfo, tally: _Tally) -> list[Finding]:
         found.append(Finding("warning", text))
     origin = tally.frame.origin
     sample = np.concatenate(tally.samples)
-    suspicion = unit_suspicion(sample, info.crs_wkt)
+    suspicion = unit_suspicion(sample, tally.frame)
     if suspicion:
         found.append(Finding("warning", f"{path.name}: {suspicion}"))
     if tally.rows < _FEW:
-        text = f"{path.name} holds only {tally.rows} points: too few to filter or register."
+        points = "1 point" if tally.rows == 1 else f"{tally.rows} points"
+        text = f"{path.name} holds only {points}: too few to filter or register."
         found.append(Finding("warning", text))
     low, high = robust_box(sample)
     is_inside_origin = bool(((-origin >= low) & (-origin <= high)).all())

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.cloud import Cloud
+from dougong.cloud import Cloud, Frame
 from dougong.typing import Points
 
 SAMPLE = 200_000
@@ -16,6 +16,11 @@ _FAR_FACTOR = 10.0
 _FAR_LEAST_M = 100.0
 _HIGH_M = 1000.0
 """No site is as high as this: the highest cliff temples rise less than half of it."""
+_DEGREES = np.array([180.0, 90.0])
+_EARTH_M = (6.33e6, 6.40e6)
+"""Distances from the earth's centre at which there are sites."""
+_NO_HEIGHT_M = 20_000.0
+"""No site lies as high, or as deep."""
 
 
 def coordinate_hashes(xyz: Points) -> NDArray[np.uint64]:
@@ -44,23 +49,41 @@ def robust_box(sample: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]
     return low - margin, high + margin
 
 
-def unit_suspicion(sample: Points, crs: str | None) -> str | None:
+def unit_suspicion(sample: Points, frame: Frame) -> str | None:
     """Return in words that coordinates without a reference system are hardly metres, or None.
 
     Parameters
     ----------
     sample : ndarray, shape (n, 3)
         Local metres.
+    frame : Frame
+        Of the cloud: says where on the map the local origin is.
     """
-    if crs is not None:
+    if frame.crs is not None:
         return None
     low, high = np.quantile(sample, [0.01, 0.99], axis=0)
-    if high[2] - low[2] < _HIGH_M:
-        return None
-    return (
-        f"it would be {high[2] - low[2]:,.0f} m high: its coordinates may be millimetres. "
-        "Scale them to metres (by 0.001 where they are)."
-    )
+    span = high - low
+    first, last = frame.to_file(np.stack([low, high]))
+    middle = (first + last) / 2
+    is_place = (np.abs([first, last])[:, :2] <= _DEGREES).all()
+    if is_place and 0 < span[:2].max() < 0.05 and span[2] > 20 * span[:2].max():
+        return (
+            f"it spans {span[0]:.3g} by {span[1]:.3g} in plan but {span[2]:.3g} in height: "
+            "x and y may be degrees. Reproject it to metres."
+        )
+    is_deep = abs(middle[2]) > _NO_HEIGHT_M
+    if is_deep and _EARTH_M[0] < float(np.linalg.norm(middle)) < _EARTH_M[1]:
+        return (
+            f"its heights would be about {middle[2]:,.0f} m, and its points lie an earth's radius "
+            "from 0, 0, 0: they may be earth-centred coordinates, where z does not point up. "
+            "Reproject it to a map projection."
+        )
+    if span[2] >= _HIGH_M:
+        return (
+            f"it would be {span[2]:,.0f} m high: its coordinates may be millimetres. "
+            "Scale them to metres (by 0.001 where they are)."
+        )
+    return None
 
 
 def faults_of(cloud: Cloud) -> tuple[str, ...]:
@@ -78,7 +101,7 @@ def faults_of(cloud: Cloud) -> tuple[str, ...]:
     far = _beyond(cloud.xyz, low, high)
     if far:
         found.append(f"{far:,} of {len(cloud):,} points lie far from all others.")
-    suspicion = unit_suspicion(sample, cloud.frame.crs)
+    suspicion = unit_suspicion(sample, cloud.frame)
     return (*found, suspicion) if suspicion else tuple(found)
 
 

@@ -312,6 +312,9 @@ def read_header(file: IO[bytes], path: Path) -> LasHeader:
     if not (np.isfinite(header.scale).all() and (header.scale > 0).all()):
         msg = f"{name} has scale {header.scale.tolist()}; it must be positive. Export it again."
         raise FormatError(msg)
+    if not np.isfinite(header.offset).all():
+        msg = f"{name} has offset {header.offset.tolist()}; it must be finite. Export it again."
+        raise FormatError(msg)
     start, count = header.evlr_place
     if count:
         size = file.seek(0, 2)

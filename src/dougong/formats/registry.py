@@ -34,18 +34,23 @@ def kind_of(path: Path) -> str:
     """
     kind = SUFFIXES.get(path.suffix.lower())
     with opened(path) as file:
-        head = file.read(16)
-    if kind is None:
+        head = file.read(128)
+    found = next((name for start, name in _SIGNATURES if head.startswith(start)), None)
+    if found is None and kind is not None:
+        return kind
+    if found is None:
+        has = f"the suffix {path.suffix!r}" if path.suffix else "no suffix"
         msg = (
-            f"{path.name} has the suffix {path.suffix or 'none'!r}; point clouds that can be read "
+            f"{path.name} has {has}; point clouds that can be read "
             f"end in {', '.join(SUFFIXES)}. Rename or export it."
         )
         raise FormatError(msg)
-    found = next((name for start, name in _SIGNATURES if head.startswith(start)), None)
-    if found is not None and found != kind:
-        suffix = next(suffix for suffix, name in SUFFIXES.items() if name == found)
+    if found != kind:
+        is_packed = found == "las" and len(head) > 104 and head[104] & 0x80
+        suffix = ".laz" if is_packed else next(s for s, name in SUFFIXES.items() if name == found)
+        other = f"not {_SHOWN[kind]}" if kind is not None else "which its name does not say"
         msg = (
-            f"{path.name} is a {_SHOWN[found]} file by its first bytes, not {_SHOWN[kind]}. "
+            f"{path.name} is a {_SHOWN[found]} file by its first bytes, {other}. "
             f"Rename it to {path.with_suffix(suffix).name}."
         )
         raise FormatError(msg)
