@@ -32,13 +32,12 @@ def test_two_systems_are_named_before_what_the_search_says():
     said = notes("EPSG:32650", "EPSG:4547")
     assert "scan is in WGS 84 / UTM zone 50N" in said[0]
     assert "drone in CGCS2000 / 3-degree Gauss-Kruger CM 114E" in said[0]
-    assert said[1:] == ("searched",)
+    assert said[-1] == "searched"
 
 
 @pytest.mark.parametrize(
     ("source", "target"),
     [
-        (None, "EPSG:32650"),
         (None, None),
         ("EPSG:32650", "EPSG:32650"),
         ("EPSG:32650", as_wkt("EPSG:32650")),
@@ -66,3 +65,9 @@ def test_duplicates_do_not_outweigh_the_site(monkeypatch):
     dougong.register(heap, Cloud.from_points(POINTS))
     assert [len(cloud) for cloud in seen[0][:2]] == [2, 2]
     np.testing.assert_array_equal(seen[0][0].frame.to_file(seen[0][0].xyz), POINTS)
+
+
+def test_a_file_without_a_system_among_the_coordinates_of_another_is_taken_to_share_it():
+    said = notes(None, "EPSG:32650")
+    assert said[0].startswith("scan has no coordinate system, and its coordinates lie within")
+    assert len(said) == 2

@@ -27,6 +27,7 @@ def command(
     filtered: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     yaw_hint: float | None = None,
     pairs: Path | None = None,
+    grid_scale: str = "auto",
     accept_best: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     common: Common = DEFAULT,
@@ -64,6 +65,9 @@ def command(
     pairs
         Places picked in both clouds with `dougong view SOURCE TARGET --pairs FILE`: their pose is
         one more for the proof to hear, and never ok by itself.
+    grid_scale
+        Combined factor (grid / ground) of a cloud in a map projection; auto: from its system and
+        height; off: the map is true to scale, as site-calibrated ground systems are; or a number.
     accept_best
         Exit with 0 and take the best pose where several are possible; the status stays.
     overwrite
@@ -81,6 +85,7 @@ def command(
                 "dof": dof,
                 "filtered": filtered,
                 "yaw_hint_deg": yaw_hint,
+                "grid_scale": grid_scale,
                 "accept_best": accept_best,
             },
             source_kind=source_kind,

@@ -21,10 +21,11 @@ class Truth:
     """What the generator knows about a pair of clouds."""
 
     T_target_source: Transform
-    """The true rigid motion, lidar file coordinates to map file coordinates, without bending."""
+    """The true motion, lidar file coordinates to map file coordinates, without bending: rigid, or
+    of the map's scale in plan where the drone cloud is in a projection that has one."""
     T_best: Transform
-    """The rigid motion nearest to the bent surface: argmin of the area integral over the surface
-    both sensors saw of |T x - (T_target_source x + d(x))|^2."""
+    """The motion of that scale nearest to the bent surface: argmin of the area integral over the
+    surface both sensors saw of |T x - (T_target_source x + d(x))|^2."""
     surface_points: Points
     """(m, 3) lidar file coordinates; uniform by area over the surface both sensors saw."""
     surface_bent: Points
@@ -44,7 +45,7 @@ class PoseErrors:
     rotation_error_deg: float
     """Angle between the pose and T_best."""
     scale_error_ppm: float
-    """(scale of the pose - 1) x 1e6; zero for a rigid one."""
+    """(scale of the pose / that of T_best - 1) x 1e6; zero for a rigid one on a rigid map."""
     translation_at_centroid_m: NDArray[np.float64]
     """(3,) pose minus T_best at the centroid of the shared surface, map axes."""
     is_correct: bool
@@ -53,17 +54,18 @@ class PoseErrors:
     """tre95_m <= 0.020 and rotation_error_deg <= 0.02."""
 
 
-def fit_rigid(source: Points, target: Points) -> Transform:
-    """Return the rigid motion that brings `source` nearest to `target` in the least squares.
+def fit_rigid(source: Points, target: Points, scale: float = 1.0) -> Transform:
+    """Return the motion of a known `scale` that brings `source` nearest to `target`.
 
-    Both (n, 3), paired, n >= 3 and not on a line; coordinates may be as large as map coordinates.
+    In the least squares. Both (n, 3), paired, n >= 3 and not on a line; coordinates may be as large
+    as map coordinates.
     Kabsch (1976) by singular value decomposition, proper rotations only.
     """
     centre_source, centre_target = source.mean(axis=0), target.mean(axis=0)
     left, _, right = np.linalg.svd((target - centre_target).T @ (source - centre_source))
     mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     matrix = np.eye(4)
-    matrix[:3, :3] = left @ mirror @ right
+    matrix[:3, :3] = scale * (left @ mirror @ right)
     matrix[:3, 3] = centre_target - matrix[:3, :3] @ centre_source
     return matrix
 
@@ -106,14 +108,15 @@ def pose_errors(matrix: ArrayLike, truth: Truth) -> PoseErrors:
     from_best = displacements(pose, truth.T_best, points)
     bend = _left_by(truth.T_best, truth)
     scale = float(np.cbrt(np.linalg.det(pose[:3, :3])))
+    scale_best = float(np.cbrt(np.linalg.det(truth.T_best[:3, :3])))
     tre95 = percentile95(np.linalg.norm(from_best, axis=1))
-    angle = rotation_angle_deg(pose[:3, :3] / scale, truth.T_best[:3, :3])
+    angle = rotation_angle_deg(pose[:3, :3] / scale, truth.T_best[:3, :3] / scale_best)
     return PoseErrors(
         tre95_m=tre95,
         bending_floor95_m=percentile95(np.linalg.norm(bend, axis=1)),
         total95_m=percentile95(np.linalg.norm(from_best + bend, axis=1)),
         rotation_error_deg=angle,
-        scale_error_ppm=(scale - 1) * 1e6,
+        scale_error_ppm=(scale / scale_best - 1) * 1e6,
         translation_at_centroid_m=from_best.mean(axis=0),
         is_correct=tre95 <= CORRECT_TRE95_M,
         is_accurate=tre95 <= ACCURATE_TRE95_M and angle <= ACCURATE_ROTATION_DEG,

@@ -17,12 +17,13 @@ from dougong.evaluation import site as sites
 from dougong.evaluation import stations as places
 from dougong.evaluation.buildings import cave, hall, pagoda, tulou, wall
 from dougong.evaluation.buildings.base import Building
+from dougong.evaluation.chart import Map
 from dougong.evaluation.mesh import SURFACE, Bytes, Mesh, Tracer, join
 from dougong.evaluation.metrics import Truth
 from dougong.evaluation.survey import Scene, World, stream, survey
 from dougong.typing import Points
 
-__all__ = ["BUILDERS", "Scene", "SceneKind", "Truth", "make_scene", "scan_mesh"]
+__all__ = ["BUILDERS", "Map", "Scene", "SceneKind", "Truth", "make_scene", "scan_mesh"]
 
 SceneKind = Literal["hall", "pagoda", "tulou", "wall", "cave"]
 BUILDERS: dict[str, Callable[..., Building]] = {
@@ -46,6 +47,7 @@ def make_scene(
     max_tilt_deg: float = 0.6,
     scanner: scanners.Scanner | None = None,
     drone: drones.Drone | None = None,
+    on_map: Map | None = None,
 ) -> Scene:
     """Generate a building with its surroundings and survey it twice.
 
@@ -67,6 +69,8 @@ def make_scene(
         The scanner frame is off level by up to this.
     scanner, drone : Scanner, Drone, optional
         Further settings of the sensors; their points and outliers are overridden.
+    on_map : Map, optional
+        The drone cloud's reference system and place; by default a map that is true to scale.
 
     Raises
     ------
@@ -83,7 +87,7 @@ def make_scene(
     pilot = (drone or drones.Drone()).model_copy(
         update={"points": photogrammetry_points, "outliers": outliers}
     )
-    return survey(kind, seed, world, surveyor, pilot, bending, max_tilt_deg, tracer)
+    return survey(kind, seed, world, surveyor, pilot, bending, max_tilt_deg, tracer, on_map)
 
 
 def _world(kind: str, seed: int, site: bool) -> tuple[World, Tracer]:

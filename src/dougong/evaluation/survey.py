@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,13 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from dougong.cloud import Cloud
 from dougong.evaluation import drone as drones
 from dougong.evaluation import scanner as scanners
+from dougong.evaluation.chart import Chart, Map, chart_of
 from dougong.evaluation.mesh import COLOURS, FINE, GROUND, SURFACE, Mesh, Tracer
 from dougong.evaluation.metrics import Truth, fit_rigid
 from dougong.typing import Points, Transform
-
-EPSG_MAP = 4549
-"""CGCS2000 / 3-degree Gauss-Kruger, central meridian 120 E. Near the meridian and near sea level
-its map scale is 1 within a few ppm, so that a rigid truth is also what the CRS says."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +59,7 @@ def survey(
     bending: bool,
     max_tilt_deg: float,
     tracer: Tracer | None = None,
+    on_map: Map | None = None,
 ) -> Scene:
     """Let both sensors survey a world; `tracer`, of its still part, spares building it again."""
     still = tracer or Tracer(world.static)
@@ -72,14 +69,15 @@ def survey(
         flight_tracer, world.centre, world.radius, world.top, stream(seed, f"{name} cameras")
     )
     bend = drones.draw_bending(world.centre, world.reach, stream(seed, f"{name} bend"), bending)
-    T_lidar_site, T_map_site = draw_poses(world, stream(seed, f"{name} pose"), max_tilt_deg)
+    T_lidar_site, drawn = draw_poses(world, stream(seed, f"{name} pose"), max_tilt_deg)
+    chart = chart_of(on_map or Map(), drawn)
     seen = _shared_surface(
         world,
         (scan_tracer, scanner),
         (flight_tracer, cameras, drone),
         stream(seed, f"{name} truth"),
     )
-    truth = _truth(seen, bend, T_lidar_site, T_map_site)
+    truth = _truth(seen, bend, T_lidar_site, chart)
     scanned = scanners.scan(scan_tracer, world.stations, scanner, stream(seed, f"{name} lidar"))
     flown = drones.photograph(flight_tracer, cameras, drone, stream(seed, f"{name} drone"))
     return Scene(
@@ -87,7 +85,7 @@ def survey(
         seed=seed,
         lidar=_lidar_cloud(scanned, T_lidar_site),
         photogrammetry=_drone_cloud(
-            flown, bend, T_map_site, flight_tracer.mesh, stream(seed, f"{name} paint")
+            flown, bend, chart, flight_tracer.mesh, stream(seed, f"{name} paint")
         ),
         truth=truth,
     )
@@ -155,20 +153,25 @@ def _shared_surface(
     return points[drones.is_seen(tracer, cameras, points, normals, drone)]
 
 
-def _truth(
-    seen: Points, bend: drones.Bending, T_lidar_site: Transform, T_map_site: Transform
-) -> Truth:
+def _truth(seen: Points, bend: drones.Bending, T_lidar_site: Transform, chart: Chart) -> Truth:
     source = _apply(T_lidar_site, seen)
     bent_site = seen + bend.at(seen)
     inverse = np.eye(4)
     inverse[:3, :3] = T_lidar_site[:3, :3].T
     inverse[:3, 3] = -inverse[:3, :3] @ T_lidar_site[:3, 3]
-    # Fitted in site coordinates, where numbers are small; then put on the map.
+    bent_map = chart.at(bent_site)
+    if chart.projection is None:
+        # Fitted in site coordinates, where numbers are small; then put on the map.
+        best = chart.T_map_site @ fit_rigid(source, bent_site)
+    else:
+        middle = chart.T_map_site[:3, 3]
+        best = fit_rigid(source, bent_map - middle, scale=chart.scale)
+        best[:3, 3] += middle
     return Truth(
-        T_target_source=T_map_site @ inverse,
-        T_best=T_map_site @ fit_rigid(source, bent_site),
+        T_target_source=chart.T_map_site @ inverse,
+        T_best=best,
         surface_points=source,
-        surface_bent=_apply(T_map_site, bent_site),
+        surface_bent=bent_map,
     )
 
 
@@ -185,7 +188,7 @@ def _lidar_cloud(scanned: scanners.Returns, T_lidar_site: Transform) -> Cloud:
 def _drone_cloud(
     flown: scanners.Returns,
     bend: drones.Bending,
-    T_map_site: Transform,
+    chart: Chart,
     mesh: Mesh,
     rng: np.random.Generator,
 ) -> Cloud:
@@ -193,18 +196,11 @@ def _drone_cloud(
     paint[flown.face < 0] = rng.uniform(40, 230, (int((flown.face < 0).sum()), 3))
     colours = (np.clip(paint + rng.normal(0.0, 5.0, paint.shape), 0, 255) * 257).astype(np.uint16)
     return Cloud.from_points(
-        _apply(T_map_site, flown.xyz + bend.at(flown.xyz)),
+        chart.at(flown.xyz + bend.at(flown.xyz)),
         name="photogrammetry",
-        crs=_map_crs(),
+        crs=chart.crs,
         red=colours[:, 0],
         green=colours[:, 1],
         blue=colours[:, 2],
         truth_label=flown.labels,
     )
-
-
-@cache
-def _map_crs() -> str:
-    from pyproj import CRS
-
-    return str(CRS.from_epsg(EPSG_MAP).to_wkt())

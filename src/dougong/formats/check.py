@@ -24,6 +24,7 @@ from dougong.formats.faults import (
     unit_suspicion,
 )
 from dougong.formats.model import FileInfo, Finding
+from dougong.formats.projection import projection_problem
 from dougong.formats.registry import iterate
 from dougong.formats.stream import unit_notes
 from dougong.formats.units import metric_problem
@@ -114,6 +115,9 @@ def _of_frame(info: FileInfo) -> list[Finding]:
         )
         return [Finding("warning", text)]
     problem = metric_problem(info.crs_wkt, info.extent_min, info.extent_max, name)
+    if problem is None and info.extent_min is not None and info.extent_max is not None:
+        middle = (np.array(info.extent_min) + np.array(info.extent_max)) / 2
+        problem = projection_problem(info.crs_wkt, middle, name)
     if problem:
         return [Finding("error", problem)]
     if info.unit_m != (1.0, 1.0, 1.0):

@@ -24,11 +24,14 @@ class Units:
     """Longitude and latitude: degrees, no lengths."""
     is_geocentric: bool = False
     """Earth-centred: metres, but z does not point up."""
+    is_projected: bool = False
+    """A map: easting and northing, lengths in plan scaled by the projection."""
     has_vertical: bool = False
     """The system itself says what z is measured in."""
 
 
-def _parse(text: str) -> Any:
+@lru_cache(maxsize=64)
+def parse_crs(text: str) -> Any:
     """Return the pyproj CRS of WKT or "EPSG:n" `text`, None where it is not understood."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -46,7 +49,7 @@ def as_wkt(text: str) -> str | None:
     A system that names its own EPSG code, and is what that code stands for, is written as the
     EPSG database words it: the same system then is the same text, whichever file it came from.
     """
-    crs = _parse(text)
+    crs = parse_crs(text)
     if crs is None:
         return None
     registered = _registered(crs)
@@ -63,7 +66,7 @@ def _codes(crs: Any) -> tuple[int, ...] | None:
 
 def epsg_of(wkt: str) -> tuple[int, ...] | None:
     """Return the EPSG code of a system, or those of its parts, None where it names none."""
-    crs = _parse(wkt)
+    crs = parse_crs(wkt)
     return _codes(crs) if crs is not None else None
 
 
@@ -85,7 +88,7 @@ def is_same_crs(first: str | None, second: str | None) -> bool:
     """Say whether two WKT texts mean the same reference system; two None do."""
     if first == second or first is None or second is None:
         return first == second
-    one, other = _parse(first), _parse(second)
+    one, other = parse_crs(first), parse_crs(second)
     return one is not None and other is not None and one.equals(other, ignore_axis_order=True)
 
 
@@ -94,7 +97,7 @@ def las_wkt(text: str) -> str:
     """Return `text` as the WKT 1 that LAS 1.4 asks for, or as it is where WKT 1 has no words."""
     from pyproj.exceptions import CRSError
 
-    crs = _parse(text)
+    crs = parse_crs(text)
     if crs is None:
         return text
     try:
@@ -110,7 +113,7 @@ def units_of(wkt: str | None) -> Units:
     Where a projected system says nothing of heights, z is taken to be in the horizontal unit:
     that is how feet files without a vertical system are written.
     """
-    crs = _parse(wkt) if wkt else None
+    crs = parse_crs(wkt) if wkt else None
     if crs is None:
         return Units(name="", unit_m=METRES, names=("metre",) * 3)
     # A bound system (WKT 1 with TOWGS84) hides its axes behind its source system.
@@ -133,6 +136,7 @@ def units_of(wkt: str | None) -> Units:
         names=(names[0], names[1], names[2]),
         is_geographic=is_geographic,
         is_geocentric=bool(crs.is_geocentric),
+        is_projected=bool(crs.is_projected),
         has_vertical=has_vertical,
     )
 
@@ -206,7 +210,7 @@ def metre_form(wkt: str) -> str:
     """
     from pyproj import CRS
 
-    crs = _parse(wkt)
+    crs = parse_crs(wkt)
     if crs is None or units_of(wkt).unit_m == METRES:
         return wkt
     document = crs.to_json_dict()

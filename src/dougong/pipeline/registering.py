@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from dougong.cloud import Cloud
+from dougong.errors import FrameError
 from dougong.formats import is_same_crs, require_metric, units_of
 from dougong.formats.faults import coordinate_hashes
+from dougong.formats.projection import projection_problem
+from dougong.pipeline.ground import pair_on_ground, to_file
 from dougong.registration import Register
 from dougong.registration import register as search
 from dougong.registration.picked_pairs import PickedPairs
@@ -43,7 +46,10 @@ def register(
     Raises
     ------
     FrameError
-        A cloud is in degrees or earth-centred coordinates, or its heights have another unit.
+        A cloud is in degrees or earth-centred coordinates, its heights have another unit than its
+        plan, its easting and northing are swapped, or its map distorts the site.
+    InputError
+        A grid scale is given, and neither cloud is in a map projection.
     RegistrationError
         A cloud has too few points, or is not levelled.
 
@@ -51,17 +57,43 @@ def register(
     -----
     Deterministic; independent of thread count, point order and coordinate offset.
     """
-    require_metric(source)
-    require_metric(target)
-    result = search(
-        without_copies(source),
-        without_copies(target),
-        params,
-        source_kind=source_kind,
-        target_kind=target_kind,
-        pairs=pairs,
-    )
-    return replace(result, notes=(*different_systems(source, target), *result.notes))
+    for cloud in (source, target):
+        require_metric(cloud)
+        require_registrable(cloud)
+    params = params or Register()
+    one, two = without_copies(source), without_copies(target)
+    pair, notes = pair_on_ground(one, two, params.grid_scale)
+    if pair is not None:
+        one, two = pair.source.cloud, pair.target.cloud
+        pairs = None if pairs is None else pair.picked(pairs)
+    result = search(one, two, params, source_kind=source_kind, target_kind=target_kind, pairs=pairs)
+    if pair is not None:
+        result = to_file(result, pair, source, target)
+    return replace(result, notes=(*different_systems(source, target), *notes, *result.notes))
+
+
+def require_registrable(cloud: Cloud) -> None:
+    """Refuse a cloud whose axes are swapped, whose units are mixed, or whose map distorts.
+
+    Raises
+    ------
+    FrameError
+        Heights have another unit than the plan (no similarity joins such a file to another), x is
+        a northing, or lengths on the map depend on their direction.
+    """
+    unit = cloud.frame.unit_m
+    if max(unit) - min(unit) > 1e-12:
+        msg = (
+            f"{cloud.name} has heights in units of {unit[2]:.6g} m and plan coordinates in units "
+            f"of {unit[0]:.6g} m; one unit is needed. Convert the heights first."
+        )
+        raise FrameError(msg)
+    if not len(cloud):
+        return
+    middle = cloud.frame.to_file(np.median(cloud.xyz, axis=0)[None])[0]
+    problem = projection_problem(cloud.frame.crs, middle, cloud.name)
+    if problem is not None:
+        raise FrameError(problem)
 
 
 def without_copies(cloud: Cloud) -> Cloud:
@@ -83,7 +115,6 @@ def different_systems(source: Cloud, target: Cloud) -> tuple[str, ...]:
         return ()
     named = (units_of(one).name or "an unnamed system", units_of(other).name or "an unnamed system")
     return (
-        f"{source.name} is in {named[0]} and {target.name} in {named[1]}: a rigid motion stands in "
-        "for the change of system and cannot undo the scale between two projections. "
-        f"Reproject {source.name} first where millimetres count.",
+        f"{source.name} is in {named[0]} and {target.name} in {named[1]}: the motion found stands "
+        "in for the change of system.",
     )

@@ -42,6 +42,8 @@ def registration_to_json(
         "target": target,
         "matrix": None if result.matrix is None else result.matrix.tolist(),
         "scale": result.scale,
+        "scale_source": result.scale_source,
+        "grid": None if result.grid is None else dict(result.grid),
         "dof": result.dof,
         "coarse": {
             "method": result.coarse_method,

@@ -62,6 +62,9 @@ class Register(Parameters):
     """The inputs are clean already: nothing is dropped before the search."""
     yaw_hint_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
     """Known turn from source to target about the vertical, within 15 degrees."""
+    grid_scale: Literal["auto", "off"] | Annotated[float, Field(gt=0.5, lt=2.0)] = "auto"
+    """Combined factor (grid / ground) of clouds in a map projection; auto: from their system and
+    height; off: they are true to scale, as site-calibrated ground systems are."""
     accept_best: bool = False
     """The caller takes the best pose of an ambiguous result; the status stays ambiguous."""
     prepare: Prepare = Prepare()
@@ -413,6 +416,7 @@ def _in_file_coordinates(
         reason=found.reason,
         probability=found.probability,
         scale=scale,
+        scale_source="none" if scale == 1.0 else "units",
         dof=6 if params.dof == "auto" else params.dof,
         coarse_method="plan" if params.coarse == "auto" else params.coarse,
         hypotheses=listed,

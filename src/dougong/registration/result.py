@@ -74,6 +74,10 @@ class Registration:
     margin: float
     """1 - s2/s1 over poses more than 5 degrees or 0.5 m apart; 1 when there is one pose."""
     fine: FineResult | None
+    scale_source: str = "none"
+    """What fixes the scale: none (it is 1), units, grid (crs), grid (given)."""
+    grid: Mapping[str, Any] | None = None
+    """What map projections do to lengths between the clouds; None: nothing."""
     notes: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
     parameters: Mapping[str, Any] = field(default_factory=dict)

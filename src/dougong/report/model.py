@@ -302,7 +302,7 @@ def _facts(document: Mapping[str, Any]) -> list[tuple[str, str]]:
     facts = [
         ("coarse method", f"{coarse['method']}, {len(coarse['hypotheses'])} hypotheses"),
         ("degrees of freedom", f"{document['dof']}"),
-        ("scale", f"{document['scale']:.8g}"),
+        ("scale", _scale(document)),
         ("probability that it is this pose", f"{document['probability']:.3f}"),
     ]
     if fine:
@@ -321,6 +321,19 @@ def _facts(document: Mapping[str, Any]) -> list[tuple[str, str]]:
     if spread:
         facts.append(("standard deviation of the fit", spread))
     return facts
+
+
+def _scale(document: Mapping[str, Any]) -> str:
+    """Return the scale of the matrix and what fixes it; documents before 0.2 do not say it."""
+    scale = f"{document['scale']:.9g}"
+    grid = document.get("grid")
+    if grid:
+        scale += (
+            f", known from the map projection ({grid['ppm']:+.1f} ppm in plan, "
+            f"{'as given' if grid['from'] == 'given' else 'by the coordinate system'}; heights "
+            f"off by at most {1000 * grid['height_error_m']:.1f} mm for it)"
+        )
+    return scale
 
 
 def _overlap(fine: Mapping[str, Any], bound: str) -> str:
