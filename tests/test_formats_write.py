@@ -62,7 +62,7 @@ def test_the_input_is_never_the_output(tmp_path):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("a.e57", "written as"),
+        ("a.pcd", "written as"),
         ("a.xyz", "written as"),
         ("a", "suffix 'none'"),
         ("nowhere/a.las", "not a folder"),

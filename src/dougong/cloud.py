@@ -118,8 +118,8 @@ class Cloud:
     """Attributes packed into bits of a record field (LAS flags)."""
     header: Any = None
     """What the format that read the cloud needs to write it again; opaque here."""
-    is_moved: bool = False
-    """True once `xyz` no longer follows from the records: a writer computes new coordinates."""
+    motion: Transform | None = None
+    """(4, 4) what `moved` did so far, between file coordinates; None: as the file has it."""
     notes: tuple[str, ...] = ()
     """What was handled while reading, in words and counted ("12 rows with NaN dropped")."""
 
@@ -162,6 +162,11 @@ class Cloud:
         return cls(
             xyz=xyz - origin, records=records, frame=Frame(origin=origin, crs=crs), name=name
         )
+
+    @property
+    def is_moved(self) -> bool:
+        """True once `xyz` no longer follows from the records: a writer must see to it."""
+        return self.motion is not None
 
     @property
     def attributes(self) -> tuple[str, ...]:
@@ -252,7 +257,7 @@ class Cloud:
             xyz=xyz,
             records=_turned(self.records, matrix[:3, :3]),
             frame=replace(target, step=step),
-            is_moved=True,
+            motion=matrix if self.motion is None else matrix @ self.motion,
         )
 
     def rebased(self, origin: NDArray[np.float64]) -> Cloud:

@@ -32,3 +32,19 @@ def unpack_lzf(data):
         for k in range(length + 2):
             out.append(out[start + k])
     return bytes(out)
+
+
+def crc32c(data):
+    """Return the CRC-32C of bytes, bit by bit."""
+    value = 0xFFFFFFFF
+    for byte in data:
+        value ^= byte
+        for _ in range(8):
+            value = (value >> 1) ^ (0x82F63B78 if value & 1 else 0)
+    return value ^ 0xFFFFFFFF
+
+
+def pack_bits(values, bits):
+    """Return integers packed lowest bit first, as one very large integer."""
+    whole = sum((int(value) & ((1 << bits) - 1)) << (k * bits) for k, value in enumerate(values))
+    return whole.to_bytes(-(-len(values) * bits // 8), "little")

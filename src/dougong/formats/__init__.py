@@ -1,7 +1,7 @@
 """Files of points: read whole or in chunks, written atomically.
 
 Formats by suffix: in .las .laz .copc.laz .e57 .ply .pcd .xyz .pts .csv .txt .asc; out .las .laz
-.copc.laz .ply. The libraries behind them are loaded when a file is opened.
+.copc.laz .e57 .ply. The libraries behind them are loaded when a file is opened.
 """
 
 from dougong.formats.atomic import part_of
@@ -9,8 +9,17 @@ from dougong.formats.check import check
 from dougong.formats.describe import describe
 from dougong.formats.faults import faults_of
 from dougong.formats.merged import write_merged
-from dougong.formats.model import FileInfo, Finding, Written
-from dougong.formats.registry import SUFFIXES, WRITABLE, iterate, read, read_stations, write
+from dougong.formats.model import FileInfo, Finding, PlacedStation, Written
+from dougong.formats.registry import (
+    SUFFIXES,
+    WRITABLE,
+    iterate,
+    read,
+    read_stations,
+    write,
+    write_stations,
+)
+from dougong.formats.reissue import can_reissue, reissue
 from dougong.formats.units import is_same_crs, require_metric, units_of
 
 __all__ = [
@@ -18,7 +27,9 @@ __all__ = [
     "WRITABLE",
     "FileInfo",
     "Finding",
+    "PlacedStation",
     "Written",
+    "can_reissue",
     "check",
     "describe",
     "faults_of",
@@ -27,8 +38,10 @@ __all__ = [
     "part_of",
     "read",
     "read_stations",
+    "reissue",
     "require_metric",
     "units_of",
     "write",
     "write_merged",
+    "write_stations",
 ]

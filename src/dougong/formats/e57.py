@@ -7,7 +7,7 @@ Source: ASTM E2807-11.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,31 +18,30 @@ from numpy.typing import NDArray
 
 from dougong.cloud import BitField, Records
 from dougong.errors import FormatError
+from dougong.formats.e57_fields import INVALID, NORMAL, FieldSpec, attribute_name, spec_of
+from dougong.formats.e57_pose import Pose, matrix_of, still
 from dougong.formats.stream import Block, opened, refuse_empty
 from dougong.formats.units import METRES, as_wkt, metre_form, units_of
 from dougong.typing import Mask, Points
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-_INVALID = ("cartesianInvalidState", "sphericalInvalidState")
-_NAMES = {
-    "colorRed": "red", "colorGreen": "green", "colorBlue": "blue", "rowIndex": "row_index",
-    "columnIndex": "column_index", "returnIndex": "return_index", "returnCount": "return_count",
-    "timeStamp": "time_stamp", "nor:normalX": "nx", "nor:normalY": "ny", "nor:normalZ": "nz",
-}  # fmt: skip
-_NORMAL = ("nx", "ny", "nz")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class E57Header:
-    """Where a cloud stands in its E57 file."""
+    """Where a cloud stands in its E57 file, and how the file holds its points."""
 
     station: int
-    rotation: NDArray[np.float64]
-    """(3, 3), scanner to file coordinates."""
-    translation: NDArray[np.float64]
-    """(3,), file units (metres)."""
-    source: Path | None = field(default=None, compare=False)
+    pose: Pose
+    """Scanner to file coordinates."""
+    name: str
+    guid: str
+    fields: Mapping[str, FieldSpec]
+    """Every field of the scan's records but text, by its E57 name."""
+    source: Path
+    stations: tuple[E57Header, ...] = ()
+    """Of several scans read as one cloud: the header of each."""
 
 
 @dataclass
@@ -53,8 +52,6 @@ class E57Scan:
     name: str
     header: E57Header
     count: int
-    fields: dict[str, str]
-    """E57 field name to dtype."""
     crs: str | None = None
     notes: tuple[str, ...] = ()
     bits: dict[str, BitField] = field(default_factory=dict)
@@ -62,19 +59,19 @@ class E57Scan:
     @property
     def dtype(self) -> np.dtype[np.void]:
         """Record layout: every field of the scan, invalid states apart."""
-        return np.dtype(
-            [(_NAMES.get(n, n), t) for n, t in self.fields.items() if n not in _INVALID]
-        )
+        fields = self.header.fields.items()
+        return np.dtype([(attribute_name(n), _dtype_of(f)) for n, f in fields if n not in INVALID])
 
     def blocks(self, rows: int) -> Iterator[Block]:
         """Yield the scan in blocks, pose applied."""
         from pye57 import libe57
 
         rows = max(1, min(rows, self.count))
-        with _image(self.path) as image:
+        with image_of(self.path) as image:
             buffers = libe57.VectorSourceDestBuffer()
             arrays: dict[str, NDArray[Any]] = {}
-            for name, dtype in self.fields.items():
+            for name, spec in self.header.fields.items():
+                dtype = _dtype_of(spec)
                 arrays[name] = np.zeros(rows, dtype=_BUFFER.get(dtype, dtype))
                 buffers.append(libe57.SourceDestBuffer(image, name, arrays[name], rows, True, True))
             reader, done = None, 0
@@ -98,18 +95,19 @@ class E57Scan:
         records: Records = np.empty(size, dtype=self.dtype)
         is_invalid: Mask = np.zeros(size, dtype=bool)
         for name, values in columns.items():
-            if name in _INVALID:
+            if name in INVALID:
                 is_invalid |= _is_unusable(values)
             else:
-                records[_NAMES.get(name, name)] = values
+                records[attribute_name(name)] = values
         local = _cartesian(columns)
-        if not np.array_equal(self.header.rotation, np.eye(3)):
-            local = local @ self.header.rotation.T
-            if set(_NORMAL) <= set(records.dtype.names or ()):
-                normals = np.stack([records[axis] for axis in _NORMAL], axis=1)
-                for axis, turned in zip(_NORMAL, (normals @ self.header.rotation.T).T, strict=True):
+        pose = self.header.pose
+        if not np.array_equal(pose.rotation, np.eye(3)):
+            local = local @ pose.rotation.T
+            if set(NORMAL) <= set(records.dtype.names or ()):
+                normals = np.stack([records[axis] for axis in NORMAL], axis=1)
+                for axis, turned in zip(NORMAL, (normals @ pose.rotation.T).T, strict=True):
                     records[axis] = turned
-        return Block(records, local + self.header.translation, is_invalid)
+        return Block(records, local + pose.translation, is_invalid)
 
 
 # pye57 0.4 fills 8-byte integer buffers at the wrong stride, and knows no 4-byte ones: doubles
@@ -141,7 +139,14 @@ def _damaged(path: Path, scan: str, promised: int, found: int) -> FormatError:
 
 
 @contextmanager
-def _image(path: Path) -> Iterator[Any]:
+def image_of(path: Path) -> Iterator[Any]:
+    """Open a file with libe57, or say in one sentence why not.
+
+    Raises
+    ------
+    FormatError
+        Not an E57 file, or damaged.
+    """
     from pye57 import libe57
 
     with opened(path) as file:
@@ -171,7 +176,7 @@ def open_e57(path: Path) -> list[E57Scan]:
     """
     from pye57 import libe57
 
-    with _image(path) as image:
+    with image_of(path) as image:
         try:
             root = image.root()
             crs, said = _crs_of(root)
@@ -213,65 +218,47 @@ def _scan(path: Path, node: Any, index: int, crs: str | None, said: tuple[str, .
 
     points = node["points"]
     prototype = libe57.StructureNode(points.prototype())
-    fields, left_out = {}, []
+    fields: dict[str, FieldSpec] = {}
+    left_out = []
     for k in range(prototype.childCount()):
         name = prototype.get(k).elementName()
-        dtype = _dtype_of(prototype[name])
-        if dtype is None:
+        spec = spec_of(prototype[name])
+        if spec is None:
             left_out.append(name)
         else:
-            fields[name] = dtype
+            fields[name] = spec
     label = str(node["name"].value()) if node.isDefined("name") else ""
     label = label.strip() or f"{path.stem}_{index + 1}"
     if not (set(_CARTESIAN) <= set(fields) or set(_SPHERICAL) <= set(fields)):
         msg = f"{path.name}: scan {label!r} has no coordinates, only {', '.join(fields)}."
         raise FormatError(msg)
-    rotation, translation = _pose_of(node)
     notes = (f"text fields were not read: {', '.join(left_out)}.",) if left_out else ()
-    header = E57Header(index, rotation, translation, source=path)
-    return E57Scan(path, label, header, int(points.childCount()), fields, crs, (*said, *notes))
+    guid = str(node["guid"].value()) if node.isDefined("guid") else ""
+    header = E57Header(index, pose_of_node(node), label, guid, fields, source=path)
+    return E57Scan(path, label, header, int(points.childCount()), crs, (*said, *notes))
 
 
-def _dtype_of(node: Any) -> str | None:
-    """Return the smallest dtype that holds a field exactly; None for text."""
-    from pye57 import libe57
-
-    if isinstance(node, libe57.FloatNode):
-        return "f4" if node.precision() == libe57.E57_SINGLE else "f8"
-    if isinstance(node, libe57.ScaledIntegerNode):
+def _dtype_of(spec: FieldSpec) -> str:
+    """Return the smallest dtype that holds a field exactly."""
+    if spec.kind == "float":
+        return "f4" if spec.is_single else "f8"
+    if spec.kind == "scaled":
         return "f8"
-    if not isinstance(node, libe57.IntegerNode):
-        return None
-    low, high = int(node.minimum()), int(node.maximum())
-    for dtype in ("u1", "u2", "u4") if low >= 0 else ("i1", "i2", "i4"):
-        if np.iinfo(dtype).min <= low and high <= np.iinfo(dtype).max:
+    for dtype in ("u1", "u2", "u4") if spec.low >= 0 else ("i1", "i2", "i4"):
+        if np.iinfo(dtype).min <= spec.low and spec.high <= np.iinfo(dtype).max:
             return dtype
     return "i8"
 
 
-def _pose_of(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    rotation, translation = np.eye(3), np.zeros(3)
+def pose_of_node(node: Any) -> Pose:
+    """Return the pose of a scan or picture; without one its coordinates are the file's."""
+    pose = still()
     if not node.isDefined("pose"):
-        return rotation, translation
-    pose = node["pose"]
-    if pose.isDefined("rotation"):
-        quaternion = [float(pose["rotation"][axis].value()) for axis in "wxyz"]
-        rotation = _matrix_of(np.array(quaternion))
-    if pose.isDefined("translation"):
-        translation = np.array([float(pose["translation"][axis].value()) for axis in "xyz"])
-    return rotation, translation
-
-
-def _matrix_of(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation of a quaternion (w, x, y, z), which need not have length one."""
-    length = float(np.linalg.norm(quaternion))
-    if length == 0:
-        return np.eye(3)
-    w, x, y, z = quaternion / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+        return pose
+    rotation, translation = pose.rotation, pose.translation
+    if node["pose"].isDefined("rotation"):
+        quaternion = [float(node["pose"]["rotation"][axis].value()) for axis in "wxyz"]
+        rotation = matrix_of(np.array(quaternion))
+    if node["pose"].isDefined("translation"):
+        translation = np.array([float(node["pose"]["translation"][a].value()) for a in "xyz"])
+    return Pose(rotation, translation)

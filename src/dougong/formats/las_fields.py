@@ -1,5 +1,9 @@
 """Which attribute of another format belongs into which LAS field, and as what number."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,6 +29,8 @@ _WHOLE = {
     "classification": 255, "user_data": 255, "point_source_id": 65535,
     "return_number": 15, "number_of_returns": 15,
 }  # fmt: skip
+_COLOURS = ("red", "green", "blue", "nir")
+_FIELDS = {*_COLOURS, "gps_time", "intensity", *_WHOLE}
 
 
 def canonical(name: str) -> str:
@@ -38,19 +44,38 @@ def coordinate_fields(cloud: Cloud) -> set[str]:
     return _COORDINATES & set(cloud.attributes)
 
 
-def _whole(values: NDArray[Any], most: int) -> NDArray[np.uint64] | None:
-    """Return `values` as integers in 0..most, or None where one of them is not."""
-    if values.ndim != 1 or values.dtype.kind not in "iufb":
-        return None
-    with np.errstate(invalid="ignore"):
-        fits = (values >= 0) & (values <= most) & (values == np.rint(values))
-    return values.astype(np.uint64) if fits.all() else None
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What must be known of all values of an attribute before a LAS field can take it."""
+
+    low: float
+    high: float
+    is_whole: bool
+    """Every value is a finite integer."""
+
+    def fits(self, most: int) -> bool:
+        """Say whether the values are integers in 0..most."""
+        return self.is_whole and self.low >= 0 and self.high <= most
+
+    def joined(self, other: Facts) -> Facts:
+        """Return the facts of both together."""
+        return Facts(
+            float(np.minimum(self.low, other.low)),
+            float(np.maximum(self.high, other.high)),
+            self.is_whole and other.is_whole,
+        )
 
 
-def _colour(values: NDArray[Any], *, is_eight_bit: bool) -> NDArray[np.uint64] | None:
-    whole = _whole(values, 65535)
-    # LAS colours fill 16 bits; x257 maps 0..255 onto 0..65535 and can be undone exactly.
-    return whole if whole is None or not is_eight_bit else whole * np.uint64(257)
+def facts_of(cloud: Cloud) -> dict[str, Facts]:
+    """Return the facts of every attribute that LAS may have a field for."""
+    found = {}
+    for name, values in columns_of(cloud).items():
+        is_number = values.ndim == 1 and values.dtype.kind in "iufb" and len(values)
+        if canonical(name) in _FIELDS and is_number:
+            is_whole = values.dtype.kind != "f" or bool((values == np.rint(values)).all())
+            low, high = float(values.min()), float(values.max())
+            found[name] = Facts(low, high, is_whole and bool(np.isfinite([low, high]).all()))
+    return found
 
 
 def columns_of(cloud: Cloud) -> dict[str, NDArray[Any]]:
@@ -66,8 +91,17 @@ def columns_of(cloud: Cloud) -> dict[str, NDArray[Any]]:
     return found
 
 
-def fill_standard(records: Records, cloud: Cloud, notes: list[str]) -> dict[str, NDArray[Any]]:
-    """Fill LAS fields of `records` from `cloud`; return the attributes that found no place."""
+def fill_standard(
+    records: Records, cloud: Cloud, notes: list[str], facts: Mapping[str, Facts] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Fill LAS fields of `records` from `cloud`; return the attributes that found no place.
+
+    Parameters
+    ----------
+    facts : mapping, optional
+        Of the whole cloud, where `cloud` is a piece of it: every piece is then stored alike.
+    """
+    facts = facts_of(cloud) if facts is None else facts
     left: dict[str, NDArray[Any]] = {}
     columns = columns_of(cloud)
     colours = {canonical(name): values for name, values in columns.items()}
@@ -75,8 +109,10 @@ def fill_standard(records: Records, cloud: Cloud, notes: list[str]) -> dict[str,
     is_eight_bit = bool(rgb) and all(v.dtype.itemsize == 1 for v in rgb)
     taken: set[str] = set()
     for name, values in columns.items():
-        target = canonical(name)
-        placed = target not in taken and _place(records, target, values, is_eight_bit, notes)
+        target, known = canonical(name), facts.get(name)
+        placed = ""
+        if known is not None and target not in taken:
+            placed = _place(records, target, values, known, is_eight_bit, notes)
         if placed:
             taken.add(target)
         if placed != "whole":
@@ -85,26 +121,31 @@ def fill_standard(records: Records, cloud: Cloud, notes: list[str]) -> dict[str,
 
 
 def _place(
-    records: Records, target: str, values: NDArray[Any], is_eight_bit: bool, notes: list[str]
+    records: Records,
+    target: str,
+    values: NDArray[Any],
+    facts: Facts,
+    is_eight_bit: bool,
+    notes: list[str],
 ) -> str:
     """Put one attribute into its field; "whole": nothing is lost, "part": keep it besides, ""."""
-    if target in ("red", "green", "blue", "nir") and target in (records.dtype.names or ()):
-        colour = _colour(values, is_eight_bit=is_eight_bit)
-        if colour is None:
+    if target in _COLOURS and target in (records.dtype.names or ()):
+        if not facts.fits(65535):
             return ""
-        records[target] = colour
+        # LAS colours fill 16 bits; x257 maps 0..255 onto 0..65535 and can be undone exactly.
+        records[target] = values.astype(np.uint64) * np.uint64(257 if is_eight_bit else 1)
         if is_eight_bit and target == "red":
             notes.append("8-bit colours are written times 257, as LAS has 16-bit ones.")
         return "whole"
-    if target == "gps_time" and values.ndim == 1 and values.dtype.kind == "f":
+    if target == "gps_time" and values.dtype.kind == "f":
         records["gps_time"] = values
         return "whole"
-    if target == "intensity" and values.ndim == 1:
-        return _place_intensity(records, values, notes)
+    if target == "intensity":
+        return _place_intensity(records, values, facts, notes)
     if target in _WHOLE:
-        whole = _whole(values, _WHOLE[target])
-        if whole is None:
+        if not facts.fits(_WHOLE[target]):
             return ""
+        whole = values.astype(np.uint64)
         if target == "return_number":
             records["bit_fields"] = (records["bit_fields"] & 0xF0) | whole.astype("u1")
         elif target == "number_of_returns":
@@ -115,20 +156,32 @@ def _place(
     return ""
 
 
-def _place_intensity(records: Records, values: NDArray[Any], notes: list[str]) -> str:
-    whole = _whole(values, 65535)
-    if whole is not None:
-        records["intensity"] = whole
+def _place_intensity(records: Records, values: NDArray[Any], facts: Facts, notes: list[str]) -> str:
+    if facts.fits(65535):
+        records["intensity"] = values.astype(np.uint64)
         return "whole"
-    if values.dtype.kind == "f" and np.isfinite(values).all() and values.min() >= 0:
-        most = 65535.0 if values.max() <= 1.0 else 1.0
-        if values.max() * most <= 65535.0:
-            records["intensity"] = np.rint(values * most)
-            notes.append(
-                "intensity is fractional: LAS intensity holds it "
-                f"{'times 65535, ' if most > 1 else ''}rounded; the exact values are kept in "
-                "the extra dimension intensity_float."
-            )
-            return "part"
+    most = 65535.0 if facts.high <= 1.0 else 1.0
+    if values.dtype.kind == "f" and facts.low >= 0 and facts.high * most <= 65535.0:
+        records["intensity"] = np.rint(values * most)
+        notes.append(
+            "intensity is fractional: LAS intensity holds it "
+            f"{'times 65535, ' if most > 1 else ''}rounded; the exact values are kept in "
+            "the extra dimension intensity_float."
+        )
+        return "part"
     notes.append("intensity does not fit LAS's 0..65535: kept in extra dimension intensity_float.")
     return ""
+
+
+def shrunk_colours(columns: dict[str, NDArray[Any]], notes: list[str]) -> dict[str, NDArray[Any]]:
+    """Return columns whose 16-bit colours are the 8-bit ones viewers expect, if no bit is lost."""
+    colours = {n: columns[n] for n in ("red", "green", "blue") if n in columns}
+    if not colours or any(values.dtype.itemsize != 2 for values in colours.values()):
+        return columns
+    for factor in (257, 256):
+        if all(not (values % factor).any() for values in colours.values()):
+            return columns | {n: (v // factor).astype(np.uint8) for n, v in colours.items()}
+    if all((values <= 255).all() for values in colours.values()):
+        return columns | {name: values.astype(np.uint8) for name, values in colours.items()}
+    notes.append("colours stay 16-bit, as they use more than 8; some viewers expect 8.")
+    return columns

@@ -6,9 +6,11 @@ cloud from another format is fitted into LAS 1.4: known attributes go to their L
 rest become extra dimensions, and what cannot be held is said.
 """
 
+from __future__ import annotations
+
 import struct
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from dougong.cloud import Cloud, Records
 from dougong.errors import OutputError
 from dougong.formats.geotiff import geokeys_of
 from dougong.formats.las import crs_of, has_mixed_channels
-from dougong.formats.las_fields import canonical, coordinate_fields, fill_standard
+from dougong.formats.las_fields import Facts, canonical, coordinate_fields, fill_standard
 from dougong.formats.las_header import (
     EXTRA_BYTES,
     EXTRA_TYPES,
@@ -39,8 +41,18 @@ MOVED_M = 1e-3
 _DEGREES = 1e-7
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Whole:
+    """What is known of a whole file while it is converted in pieces, so that all come out alike."""
+
+    corners: Points
+    """(k, 3) file coordinates of the output between which all points lie."""
+    facts: Mapping[str, Facts]
+    has_mixed_channels: bool = False
+
+
 def las_parts(
-    cloud: Cloud, *, modern: bool = False, packed: bool = False
+    cloud: Cloud, *, modern: bool = False, packed: bool = False, whole: Whole | None = None
 ) -> tuple[LasHeader, Records, list[str]]:
     """Return header, records and notes that hold `cloud` as LAS.
 
@@ -50,6 +62,8 @@ def las_parts(
         Ask for point format 6, 7 or 8 (COPC); a file that has another one is upgraded.
     packed : bool
         The records will be compressed: waveforms that this would damage are left out.
+    whole : Whole, optional
+        Of the file that `cloud` is a piece of.
 
     Raises
     ------
@@ -58,25 +72,27 @@ def las_parts(
     """
     notes: list[str] = []
     if isinstance(cloud.header, LasHeader):
-        header, records = _kept(cloud, cloud.header)
-        is_unsafe = packed and has_mixed_channels(records)
+        header, records = _kept(cloud, cloud.header, whole)
+        is_mixed = has_mixed_channels(records) if whole is None else whole.has_mixed_channels
+        is_unsafe = packed and is_mixed
         if is_unsafe or (modern and header.point_format not in (6, 7, 8)):
             header, records = upgraded(header, records, notes)
         header, records = _with_extras(header, records, notes)
     else:
-        header, records = _built(cloud, notes)
+        header, records = _built(cloud, notes, whole)
     header = with_crs(header, cloud.frame.crs, notes)
     return header, records, notes
 
 
-def _kept(cloud: Cloud, header: LasHeader) -> tuple[LasHeader, Records]:
+def _kept(cloud: Cloud, header: LasHeader, whole: Whole | None) -> tuple[LasHeader, Records]:
     if not cloud.is_moved:
         return header, cloud.records
     coordinates = cloud.frame.to_file(cloud.xyz)
     step = np.minimum(
         np.asarray(cloud.frame.step or header.scale), MOVED_M / np.asarray(cloud.frame.unit_m)
     )
-    scale, offset = scaling_for(coordinates, _decimal_at_most(step), cloud.name)
+    bounds = coordinates if whole is None else whole.corners
+    scale, offset = scaling_for(bounds, _decimal_at_most(step), cloud.name)
     records = cloud.records.copy()
     set_integers(records, coordinates, scale, offset)
     return header.with_scaling(scale, offset), records
@@ -134,9 +150,10 @@ def step_for(cloud: Cloud) -> NDArray[np.float64]:
     return _decimal_at_most(step)
 
 
-def _built(cloud: Cloud, notes: list[str]) -> tuple[LasHeader, Records]:
+def _built(cloud: Cloud, notes: list[str], whole: Whole | None) -> tuple[LasHeader, Records]:
     coordinates = cloud.frame.to_file(cloud.xyz)
-    scale, offset = scaling_for(coordinates, step_for(cloud), cloud.name)
+    bounds = coordinates if whole is None else whole.corners
+    scale, offset = scaling_for(bounds, step_for(cloud), cloud.name)
     names = {canonical(name) for name in cloud.attributes}
     has_colour = {"red", "green", "blue"} <= names
     header = new_header(8 if "nir" in names else 7 if has_colour else 6)
@@ -144,7 +161,7 @@ def _built(cloud: Cloud, notes: list[str]) -> tuple[LasHeader, Records]:
     records = np.zeros(len(cloud), dtype=header.dtype)
     set_integers(records, coordinates, scale, offset)
     records["bit_fields"] = 0b00010001  # return 1 of 1
-    left = fill_standard(records, cloud, notes)
+    left = fill_standard(records, cloud, notes, whole.facts if whole is not None else None)
     dropped = coordinate_fields(cloud)
     columns = {name: values for name, values in left.items() if name not in dropped}
     return _with_columns(header, records, columns, notes)

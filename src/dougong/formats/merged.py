@@ -60,7 +60,7 @@ def write_merged(
     """
     path = Path(path)
     family = family_of(path)
-    if family == ".ply":
+    if family in (".ply", ".e57"):
         raise OutputError(f"{path.name}: merged clouds are written as .las, .laz or .copc.laz.")
     if len(source_ids) != len(clouds) or not clouds:
         msg = f"write_merged needs one source id per cloud, got {len(source_ids)}, {len(clouds)}."

@@ -1,5 +1,7 @@
 """What this room hands over besides clouds: a file's description, findings, a written file."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,6 +61,19 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class PlacedStation:
+    """A scan of an E57 file with its pose."""
+
+    index: int
+    """Its place in the file it came from, from 0."""
+    name: str
+    quaternion: tuple[float, float, float, float]
+    """(w, x, y, z), scanner to file coordinates."""
+    translation: Triple
+    """Metres."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Written:
     """A finished output file."""
 
@@ -67,3 +82,5 @@ class Written:
     bytes: int
     notes: tuple[str, ...] = ()
     """What the format could not hold, or holds in another way; counted, in words."""
+    stations: tuple[PlacedStation, ...] = ()
+    """E57 issued again: where each of its scans stands now."""

@@ -1,13 +1,10 @@
 """Write a cloud as binary PLY: the vertices of a PLY file bit for bit, others converted."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from dougong.cloud import Cloud, Records
 from dougong.formats.atomic import Sink
-from dougong.formats.las_fields import columns_of, coordinate_fields
+from dougong.formats.las_fields import columns_of, coordinate_fields, shrunk_colours
 from dougong.formats.las_header import LasHeader
 from dougong.formats.ply import CRS_COMMENT, PlyHeader, has_crs
 
@@ -58,7 +55,7 @@ def _converted(cloud: Cloud, notes: list[str]) -> Records:
     layout: list[tuple[str, object]] = [(axis, "<f8") for axis in "xyz"]
     columns = {n: v for n, v in columns_of(cloud).items() if n not in dropped}
     if isinstance(cloud.header, LasHeader):
-        _shrink_colours(columns, notes)
+        columns = shrunk_colours(columns, notes)
     for name, values in columns.items():
         layout.append(
             (name, values.dtype if values.ndim == 1 else (values.dtype, values.shape[1:]))
@@ -71,19 +68,6 @@ def _converted(cloud: Cloud, notes: list[str]) -> Records:
     if not isinstance(cloud.header, PlyHeader):
         notes.append("coordinates are written as doubles, as PLY has no scaled integers.")
     return records
-
-
-def _shrink_colours(columns: dict[str, NDArray[Any]], notes: list[str]) -> None:
-    """Turn 16-bit colours into the 8-bit ones PLY viewers expect, where no bit is lost."""
-    colours = {n: columns[n] for n in ("red", "green", "blue") if n in columns}
-    for factor in (257, 256):
-        if colours and all(not (values % factor).any() for values in colours.values()):
-            columns |= {n: (values // factor).astype(np.uint8) for n, values in colours.items()}
-            return
-    if colours and all((values <= 255).all() for values in colours.values()):
-        columns |= {name: values.astype(np.uint8) for name, values in colours.items()}
-    elif colours:
-        notes.append("colours stay 16-bit, as they use more than 8; some viewers expect 8.")
 
 
 def _storable(records: Records, order: str, notes: list[str]) -> Records:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from dougong.cloud import Cloud
-from dougong.errors import FormatError, InputError, OutputError
+from dougong.errors import FormatError, FrameError, InputError, OutputError
 from dougong.formats.model import Written
 from dougong.formats.stream import Scan, iterate_scans, opened, read_scans, stem_of
+from dougong.formats.units import is_same_crs, metre_form
 
 SUFFIXES = {
     ".las": "las", ".laz": "las", ".e57": "e57", ".ply": "ply", ".pcd": "pcd",
@@ -21,7 +22,7 @@ SUFFIXES = {
 _SIGNATURES = ((b"LASF", "las"), (b"ASTM-E57", "e57"), (b"ply", "ply"), (b"# .PCD", "pcd"))
 _SHOWN = {"las": "LAS/LAZ", "e57": "E57", "ply": "PLY", "pcd": "PCD", "text": "text"}
 BLOCK_ROWS = 1_000_000
-WRITABLE = (".las", ".laz", ".copc.laz", ".ply")
+WRITABLE = (".las", ".laz", ".copc.laz", ".e57", ".ply")
 
 
 def kind_of(path: Path) -> str:
@@ -144,7 +145,15 @@ def _merged_stations(clouds: Sequence[Cloud], path: Path) -> Cloud:
         at += len(cloud)
     notes = [f"{cloud.name}: {note}" for cloud in clouds for note in cloud.notes]
     notes += [f"{name} is 0 for stations without it." for name in sorted(missing)]
-    return replace(clouds[0], xyz=xyz, records=records, name=stem_of(path), notes=tuple(notes))
+    headers = tuple(cloud.header for cloud in clouds)
+    return replace(
+        clouds[0],
+        xyz=xyz,
+        records=records,
+        name=stem_of(path),
+        header=replace(headers[0], stations=headers),
+        notes=tuple(notes),
+    )
 
 
 def iterate(path: Path | str, chunk_points: int = 1_000_000) -> Iterator[Cloud]:
@@ -173,7 +182,7 @@ def iterate(path: Path | str, chunk_points: int = 1_000_000) -> Iterator[Cloud]:
 def family_of(path: Path) -> str:
     """Return the suffix a cloud is written by, or raise OutputError naming those there are."""
     name = path.name.lower()
-    found = next((s for s in (".copc.laz", ".laz", ".las", ".ply") if name.endswith(s)), None)
+    found = next((s for s in (".copc.laz", *WRITABLE) if name.endswith(s)), None)
     if found is None:
         msg = (
             f"{path.name} has the suffix {path.suffix or 'none'!r}; clouds are written as "
@@ -190,7 +199,7 @@ def write(
     overwrite: bool = False,
     notes: Sequence[str] | None = None,
 ) -> Written:
-    """Write a cloud as LAS, LAZ, COPC or PLY, chosen by suffix; all of it or nothing.
+    """Write a cloud as LAS, LAZ, COPC, E57 or PLY, chosen by suffix; all of it or nothing.
 
     An unmoved cloud keeps its records bit for bit where the format is of the same family; a
     moved one gets new coordinates, never at a coarser step, and keeps every other bit.
@@ -213,6 +222,8 @@ def write(
     refuse_bad_target(path, overwrite=overwrite, source=getattr(cloud.header, "source", None))
     if not len(cloud):
         raise OutputError(f"{cloud.name} has no points left, so {path.name} was not written.")
+    if family == ".e57":
+        return _write_e57([cloud], path, notes or ())
     if family == ".ply":
         from dougong.formats.ply_write import ply_parts, write_ply
 
@@ -231,6 +242,59 @@ def write(
         points=len(records),
         bytes=path.stat().st_size,
         notes=(*(notes or ()), *said),
+    )
+
+
+def write_stations(
+    clouds: Sequence[Cloud], path: Path | str, *, overwrite: bool = False
+) -> Written:
+    """Write clouds of one frame as the scans of one E57 file: what `read_stations` reads.
+
+    Raises
+    ------
+    FrameError
+        The clouds have different reference systems.
+    OutputError
+        As `write`; or the suffix is another than ``.e57``.
+    """
+    path = Path(path)
+    from dougong.formats.atomic import refuse_bad_target
+
+    if family_of(path) != ".e57":
+        raise OutputError(f"{path.name}: scans are kept apart in E57 only. Name it .e57.")
+    for cloud in clouds:
+        refuse_bad_target(path, overwrite=overwrite, source=getattr(cloud.header, "source", None))
+    filled = [cloud for cloud in clouds if len(cloud)]
+    if not filled:
+        raise OutputError(f"no cloud has a point left, so {path.name} was not written.")
+    for cloud in filled:
+        if not is_same_crs(cloud.frame.crs, filled[0].frame.crs):
+            msg = (
+                f"{cloud.name} and {filled[0].name} are in different reference systems. "
+                "Move them into one frame first."
+            )
+            raise FrameError(msg)
+    return _write_e57(filled, path, ())
+
+
+def _write_e57(clouds: Sequence[Cloud], path: Path, notes: Sequence[str]) -> Written:
+    from dougong.formats.atomic import replacing
+    from dougong.formats.e57_stations import stations_of
+    from dougong.formats.e57_write import write_scans
+
+    said: list[str] = []
+    stations = [station for cloud in clouds for station in stations_of(cloud, said)]
+    crs = clouds[0].frame.crs
+    if crs is not None and metre_form(crs) != crs:
+        said.append("E57 coordinates are metres: the reference system is written in metres too.")
+    expected = sum(cloud.records.nbytes for cloud in clouds)
+    with replacing(path, expected_bytes=expected) as sink:
+        said += write_scans(sink, stations, metre_form(crs) if crs is not None else None)
+    return Written(
+        path=path,
+        points=sum(len(station) for station in stations),
+        bytes=path.stat().st_size,
+        notes=tuple(dict.fromkeys([*notes, *said])),
     )
 
 

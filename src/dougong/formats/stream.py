@@ -318,9 +318,9 @@ def _joined(parts: list[Any]) -> Any:
     return joined
 
 
-def iterate_scans(scans: list[Scan], rows: int) -> Iterator[Cloud]:
+def iterate_scans(scans: list[Scan], rows: int, survey: Survey | None = None) -> Iterator[Cloud]:
     """Yield clouds of at most `rows` points; what was dropped is noted on the first."""
-    survey = survey_of(scans, rows)
+    survey = survey_of(scans, rows) if survey is None else survey
     _refuse_no_rows(survey, scans[0].path)
     lattice = lattice_of(survey, scans[0].crs)
     notes = survey.notes()

@@ -1,0 +1,134 @@
+"""Issue a point cloud file again, moved, as LAS or LAZ: in chunks, nothing decimated.
+
+Every attribute stays; coordinates are new integers at the input's own step or a finer one. What
+must be the same for all chunks (offset, layout, how an attribute is stored) is settled by one
+pass before, for LAS by its header.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dougong.cloud import Cloud, Frame
+from dougong.formats.atomic import refuse_bad_target, replacing
+from dougong.formats.las_fields import Facts, facts_of
+from dougong.formats.las_header import LasHeader
+from dougong.formats.las_records import Whole, las_parts
+from dougong.formats.las_write import LasWriter
+from dougong.formats.model import Written
+from dougong.typing import Points, Transform
+
+_WAVEFORM_FORMATS = (9, 10)
+Chunks = Callable[[], Generator[Cloud]]
+
+
+class _OutsideBounds(Exception):
+    """A point lies where the header of its file says there is none."""
+
+
+def reissue_las(
+    chunks: Chunks,
+    source: Path,
+    output: Path,
+    matrix: Transform,
+    target: Frame,
+    *,
+    overwrite: bool = False,
+) -> Written:
+    """Write `source` again with every point moved.
+
+    Parameters
+    ----------
+    chunks : callable
+        Starts reading the file from its beginning; all its chunks share one frame.
+    source, output : Path
+    matrix : ndarray, shape (4, 4)
+        From the file coordinates of the source to those of `target`.
+    target : Frame
+
+    Raises
+    ------
+    FormatError
+        The input is damaged.
+    OutputError
+        The output exists, the disk is full, or the coordinates do not fit; nothing is left behind.
+    """
+    refuse_bad_target(output, overwrite=overwrite, source=source)
+    job = _Job(chunks, source, output, matrix, target)
+    with closing(chunks()) as reading:
+        header = next(reading).header
+    if isinstance(header, LasHeader) and header.point_format not in _WAVEFORM_FORMATS:
+        # The header says where the points lie; one that lies about it is found out while writing.
+        try:
+            return job.write(Whole(corners=job.moved_box(header.extent), facts={}))
+        except _OutsideBounds:
+            pass
+    return job.write(job.surveyed())
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    chunks: Chunks
+    source: Path
+    output: Path
+    matrix: Transform
+    target: Frame
+
+    def moved_box(self, box: Points) -> Points:
+        """Return the (8, 3) corners of the box (2, 3) about the source's points, moved."""
+        places = np.indices((2, 2, 2)).reshape(3, 8).T
+        corners = np.where(places == 0, box[0], box[1])
+        moved: Points = corners @ self.matrix[:3, :3].T + self.matrix[:3, 3]
+        return moved
+
+    def surveyed(self) -> Whole:
+        """Pass over the file once for what all its chunks must share."""
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        facts: dict[str, Facts] = {}
+        channels: set[int] = set()
+        for chunk in self.chunks():
+            there = chunk.frame.to_file(chunk.xyz)
+            low, high = np.minimum(low, there.min(axis=0)), np.maximum(high, there.max(axis=0))
+            if isinstance(chunk.header, LasHeader):
+                channel = chunk.attribute("scanner_channel")
+                channels |= set(np.unique(channel).tolist()) if channel is not None else set()
+                continue
+            for name, found in facts_of(chunk).items():
+                facts[name] = found if name not in facts else facts[name].joined(found)
+        return Whole(
+            corners=self.moved_box(np.stack([low, high])),
+            facts=facts,
+            has_mixed_channels=len(channels) > 1,
+        )
+
+    def write(self, whole: Whole) -> Written:
+        """Write the file chunk by chunk."""
+        is_packed = self.output.name.lower().endswith(".laz")
+        notes: list[str] = []
+        low, high = whole.corners.min(axis=0), whole.corners.max(axis=0)
+        with replacing(self.output, expected_bytes=self.source.stat().st_size) as sink:
+            writer: LasWriter | None = None
+            for chunk in self.chunks():
+                moved = chunk.moved(self.matrix, self.target)
+                there = moved.frame.to_file(moved.xyz)
+                slack = 1e-6 + np.asarray(moved.frame.step or 0.0)
+                if (there < low - slack).any() or (there > high + slack).any():
+                    raise _OutsideBounds
+                header, records, said = las_parts(moved, packed=is_packed, whole=whole)
+                notes += [*chunk.notes, *said]
+                if writer is None:
+                    writer = LasWriter(sink, header, is_compressed=is_packed)
+                writer.append(records)
+            assert writer is not None, "a file without points is refused where it is opened"
+            points = writer.close()
+        return Written(
+            path=self.output,
+            points=points,
+            bytes=self.output.stat().st_size,
+            notes=tuple(dict.fromkeys(notes)),
+        )

@@ -1,0 +1,91 @@
+"""Issue a file again in another frame: every point, at full resolution, in bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dougong.cloud import Cloud, Frame
+from dougong.errors import InputError
+from dougong.formats.model import Written
+from dougong.formats.registry import iterate, kind_of, scans_of
+from dougong.formats.stream import iterate_scans, survey_of
+from dougong.formats.units import metre_form
+from dougong.typing import Transform
+
+CHUNK_POINTS = 1_000_000
+
+
+def can_reissue(source: Path, output: Path) -> bool:
+    """Say whether `reissue` makes a file of `output`'s suffix from `source`."""
+    name = output.name.lower()
+    if source.suffix.lower() == ".e57":
+        return name.endswith(".e57")
+    return name.endswith((".las", ".laz")) and not name.endswith(".copc.laz")
+
+
+def reissue(
+    source: Path | str,
+    output: Path | str,
+    matrices: Sequence[Transform | None],
+    target: Frame,
+    *,
+    overwrite: bool = False,
+    chunk_points: int = CHUNK_POINTS,
+) -> Written:
+    """Write a file again with every point moved into the frame of `target`.
+
+    E57 becomes E57: records, pictures and all else keep their bits, only poses change (and, where
+    a matrix has a scale, the scanners' own coordinates). Any other file becomes LAS or LAZ: every
+    attribute stays, coordinates are new integers. Memory: a chunk, whatever the file's size.
+
+    Parameters
+    ----------
+    matrices : sequence of ndarray (4, 4) or None
+        One for each scan of an E57 file, in its order: from its file coordinates to the
+        target's. None leaves the scan out. Of other files: one.
+    target : Frame
+        Its reference system and units are those of the output; E57 has metres always.
+    chunk_points : int
+        Points in memory at a time (E57: pages of a fixed size instead).
+
+    Raises
+    ------
+    InputError
+        The number of matrices is wrong, or the output's suffix does not go with the input.
+    FormatError
+        The input is damaged.
+    OutputError
+        The output exists, or the disk is full; nothing is left behind.
+    """
+    source, output = Path(source), Path(output)
+    kind = kind_of(source)
+    if not can_reissue(source, output):
+        msg = (
+            f"{output.name} cannot be made from {source.name} in chunks: E57 is issued again as "
+            ".e57, any other file as .las or .laz. Name such an output."
+        )
+        raise InputError(msg)
+    if kind == "e57":
+        from dougong.formats.e57_reissue import reissue_e57
+
+        to_metres = np.diag([*target.unit_m, 1.0])
+        motions = [None if matrix is None else to_metres @ matrix for matrix in matrices]
+        crs = None if target.crs is None else metre_form(target.crs)
+        return reissue_e57(source, output, motions, crs=crs, overwrite=overwrite)
+    if len(matrices) != 1 or matrices[0] is None:
+        msg = f"{source.name} is one cloud, got {len(matrices)} matrices. Pass one."
+        raise InputError(msg)
+    from dougong.formats.las_reissue import reissue_las
+
+    survey = None if kind == "las" else survey_of(scans_of(source, kind), chunk_points)
+
+    def chunks() -> Generator[Cloud]:
+        if survey is None:
+            yield from iterate(source, chunk_points)
+        else:
+            yield from iterate_scans(scans_of(source, kind), chunk_points, survey)
+
+    return reissue_las(chunks, source, output, matrices[0], target, overwrite=overwrite)
