@@ -35,7 +35,7 @@ def command(
     input
         The cloud to filter.
     output
-        Where to write it: .las, .laz, .copc.laz or .ply.
+        Where to write it: .las, .laz, .copc.laz, .e57 or .ply.
     kind
         The sensor; needed for the recipe.
     only

@@ -31,7 +31,7 @@ def command(
     input
         The cloud to move: the registration's source, or another in the same coordinates.
     output
-        Where to write it: .las, .laz, .copc.laz or .ply.
+        Where to write it: .las, .laz, .copc.laz, .e57 or .ply.
     matrix
         A registration.json.
     accept_best

@@ -19,7 +19,7 @@ from dougong.formats.registry import (
     write,
     write_stations,
 )
-from dougong.formats.reissue import can_reissue, reissue
+from dougong.formats.reissue import can_reissue, reissue, scans_in
 from dougong.formats.units import is_same_crs, require_metric, units_of
 
 __all__ = [
@@ -40,6 +40,7 @@ __all__ = [
     "read_stations",
     "reissue",
     "require_metric",
+    "scans_in",
     "units_of",
     "write",
     "write_merged",

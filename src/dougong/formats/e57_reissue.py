@@ -40,6 +40,7 @@ from dougong.formats.e57_xml import (
 )
 from dougong.formats.model import PlacedStation, Written, as_triple
 from dougong.formats.stream import opened
+from dougong.formats.units import as_wkt
 from dougong.typing import Transform
 
 _BOUNDS = {
@@ -96,6 +97,22 @@ def reissue_e57(
         notes=tuple(edit.notes),
         stations=tuple(edit.stations),
     )
+
+
+def scans_in(path: Path) -> tuple[int, str | None]:
+    """Return how many scans an E57 file has, empty ones included, and its reference system.
+
+    Raises
+    ------
+    FormatError
+        Not an E57 file, or damaged.
+    """
+    with opened(path) as file:
+        layout = read_layout(file, path)
+        xml = Pages(file, layout, path.name).read(layout.xml_start, layout.xml_bytes)
+    root = parse(xml, path.name).documentElement
+    text = text_of(child(root, "coordinateMetadata")).strip()
+    return len(list(children(child(root, "data3D")))), as_wkt(text) if text else None
 
 
 def _points_end(root: Node, layout: Layout) -> int:

@@ -26,6 +26,29 @@ def can_reissue(source: Path, output: Path) -> bool:
     return name.endswith((".las", ".laz")) and not name.endswith(".copc.laz")
 
 
+def scans_in(path: Path | str) -> tuple[int, str | None]:
+    """Return how many scans a file keeps apart (1 but for E57) and its reference system, WKT.
+
+    No point is read. Scans without points count too.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read.
+    """
+    path = Path(path)
+    kind = kind_of(path)
+    if kind == "e57":
+        from dougong.formats import e57_reissue
+
+        return e57_reissue.scans_in(path)
+    if kind == "las":
+        from dougong.formats import las
+
+        return 1, las.crs_of(las.read_las_header(path))
+    return 1, scans_of(path, kind)[0].crs
+
+
 def reissue(
     source: Path | str,
     output: Path | str,

@@ -9,7 +9,17 @@ from typing import Any
 from dougong.cloud import Cloud, Frame
 from dougong.errors import InputError
 from dougong.filters.selection import Reason
-from dougong.formats import WRITABLE, describe, faults_of, is_same_crs, read, write
+from dougong.formats import (
+    WRITABLE,
+    can_reissue,
+    describe,
+    faults_of,
+    is_same_crs,
+    read,
+    reissue,
+    scans_in,
+    write,
+)
 from dougong.params import Parameters
 from dougong.pipeline.guess import guess_kind
 from dougong.pipeline.marking import GROUND_CLASS, marked, with_classes
@@ -209,32 +219,32 @@ def transform_file(
     """
     known = read_registration(matrix, accept_best=accept_best)
     refuse_output(input, output, [output], overwrite)
-    refuse_too_large([input], memory_bytes)
-    progress.stage(f"reading {input.name}")
-    cloud = read(input)
-    notes = list(cloud.notes)
-    if known.target_crs is not None and is_same_crs(cloud.frame.crs, known.target_crs):
+    notes = []
+    if known.target_crs is not None and is_same_crs(scans_in(input)[1], known.target_crs):
         notes.append(
             f"{input.name} is in {known.target}'s coordinate system already; check that it is "
             "not moved twice"
         )
     if known.status != "ok":
         notes.append(f"the pose is the best of several ({known.status}): {known.reason}")
-    moved = cloud.moved(known.matrix)
-    frame = replace(moved.frame, crs=known.target_crs)
-    if known.target_unit_m != frame.unit_m:
-        frame = Frame(crs=known.target_crs, unit_m=known.target_unit_m, step=cloud.frame.step)
-        moved = cloud.moved(known.matrix, frame)
-    else:
-        moved = replace(moved, frame=frame)
-    progress.stage(f"writing {output.name}")
+    frame = Frame(crs=known.target_crs, unit_m=known.target_unit_m)
     with watched(output):
-        written = write(moved, output, overwrite=overwrite)
+        if can_reissue(input, output):
+            progress.stage(f"moving {input.name} in chunks")
+            matrices = [known.matrix] * scans_in(input)[0]
+            written = reissue(input, output, matrices, frame, overwrite=overwrite)
+        else:
+            refuse_too_large([input], memory_bytes)
+            progress.stage(f"reading {input.name}")
+            cloud = read(input)
+            notes += cloud.notes
+            progress.stage(f"writing {output.name}")
+            written = write(cloud.moved(known.matrix, frame), output, overwrite=overwrite)
     return finite_document(
         {
             "input": str(input),
             "output": str(output),
-            "points": len(moved),
+            "points": written.points,
             "status": known.status,
             "matrix": known.matrix,
             "source": known.source,
