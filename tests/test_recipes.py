@@ -251,3 +251,23 @@ class TestCommand:
         code, document = self.run(capsys, path, tmp_path / "a.xyz", "--kind", "lidar")
         assert code == 2
         assert ".xyz" in document["error"]["message"]
+
+
+def test_a_filter_that_takes_much_for_noise_is_doubted(cloud, lidar):
+    """A cloud too sparse for the radii loses half of itself: not silently."""
+    assert not any("far more than surveys hold" in note for note in lidar.notes)
+    sparse = cloud.select(np.arange(len(cloud)) % 40 == 0)
+    found = filter_single(sparse, "curvature_weighted", single_parameters("curvature_weighted", {}))
+    (note,) = [note for note in found.notes if "far more than surveys hold" in note]
+    taken = len(sparse) - len(found.cloud)
+    assert f"took {taken} of {len(sparse)} points" in note
+
+
+def test_what_is_said_of_marked_points(cloud, tmp_path, capsys):
+    """All are written, and the reduction is said to be what the filters would do."""
+    dougong.write(cloud, tmp_path / "site.laz")
+    job = ["filter", str(tmp_path / "site.laz"), str(tmp_path / "out.laz")]
+    assert call([*job, "--only", "statistical", "--mark", "--quiet"]) == 0
+    said = capsys.readouterr().out
+    kept = json.loads((tmp_path / "out.laz.json").read_text())["points_kept"]
+    assert f"all {len(cloud):,} points with their marks, {kept:,} of them kept" in said

@@ -100,7 +100,7 @@ def smooth(surface, smooth_threshold, height_threshold, smallest_patch, cloth, i
                     and 0 <= c < surface.shape[1]
                     and landed[r, c]
                     and np.rint(abs(surface[r, c] - surface[row, column]) * 1e6)
-                    < np.rint(smooth_threshold * 1e6)
+                    <= np.rint(smooth_threshold * 1e6)
                     and cloth[row, column] - surface[row, column] < height_threshold
                 ):
                     cloth[row, column] = surface[row, column]

@@ -1,7 +1,7 @@
 """``dougong filter``: one cloud's recipe, or one filter alone."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -64,10 +64,18 @@ def command(
         )
         text = _text.join(
             _text.stages(document["stages"]),
-            f"wrote {output}: {_text.count(document['points_written'])} points, "
-            f"reduction {_text.percent(document['reduction'])}",
+            f"wrote {output}: {_written(document)}",
             _text.notes(document["notes"]),
         )
         return Answer(document=document, text=text)
 
     return execute(common, work)
+
+
+def _written(document: dict[str, Any]) -> str:
+    points = f"{_text.count(document['points_written'])} points"
+    reduction = f"reduction {_text.percent(document['reduction'])}"
+    if not document["is_marked"]:
+        return f"{points}, {reduction}"
+    kept = _text.count(document["points_kept"])
+    return f"all {points} with their marks, {kept} of them kept by the filters ({reduction})"

@@ -265,8 +265,9 @@ def smooth_slopes(
     """Lay hanging parts of the cloth down on steep slopes; return the number of particles laid.
 
     A hanging particle is laid on the surface when a particle beside it (4 neighbours) rests
-    already, the surface between the two steps by less than `smooth_threshold`, and it hangs less
-    than `height_threshold` above; this floods on through each connected hanging patch of more
+    already, the surface between the two steps by `smooth_threshold` at most (the published filter
+    asks for less, but leaves ties to rounding, and lets about half of them pass), and it hangs
+    less than `height_threshold` above; this floods on through each connected hanging patch of more
     than `smallest_patch` particles. surface, cloth, is_landed (rows, columns): inverted heights;
     cloth and is_landed are changed. The order of the flood does not change what it reaches.
     """
@@ -348,7 +349,7 @@ def _lay_patch(
             if (
                 is_supported
                 and not is_landed[to_row, to_column]
-                and rounded(abs(surface[row, column] - surface[r, c]), 0.0) < step
+                and rounded(abs(surface[row, column] - surface[r, c]), 0.0) <= step
                 and cloth[to_row, to_column] - surface[to_row, to_column] < height_threshold
             ):
                 cloth[to_row, to_column] = surface[to_row, to_column]

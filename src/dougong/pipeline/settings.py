@@ -114,7 +114,11 @@ def explain(error: ValidationError, model: type[BaseModel], where: str) -> str:
         own = first["msg"].removeprefix("Value error, ").rstrip(".")
         place = f"{key}: " if path else ""
         return f"{where}: {place}{own}.{more}"
-    said = first["msg"].removeprefix("Input should be ").replace("a valid tuple", "a list")
+    said = (
+        first["msg"]
+        .removeprefix("Input should be ")
+        .replace("a valid tuple", "a list in square brackets")
+    )
     if first["type"] == "string_pattern_mismatch":
         said = f"text that matches {first['ctx']['pattern']}"
     expected = said if said[:1].isupper() else f"expected {said}"

@@ -15,12 +15,14 @@ from dougong.filters.low_outliers import LowOutliers, low_outliers
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid
 from dougong.filters.pass_through import PassThrough, pass_through
 from dougong.filters.radius import Radius, radius
-from dougong.filters.selection import Reason, Selection
+from dougong.filters.selection import NOISE, Reason, Selection
 from dougong.filters.statistical import Statistical, statistical
 from dougong.pipeline.progress import Progress
 from dougong.typing import Index, Mask, Values
 
 UNKNOWN, NOT_GROUND, GROUND = 0, 1, 2
+_MUCH_NOISE = 0.2
+"""A filter that takes more than this share of what it sees for noise is doubted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +104,8 @@ class Bench:
                 seconds=time.perf_counter() - start,
             )
         )
-        self.notes += [f"{self.cloud.name}, {name}: {note}" for note in selection.notes]
+        said = [*selection.notes, *_doubts(reason, taken, len(asked))]
+        self.notes += [f"{self.cloud.name}, {name}: {note}" for note in said]
         return selection
 
     def result(self) -> Filtered:
@@ -129,6 +132,16 @@ class Bench:
             stages=tuple(self.stages),
             notes=tuple(self.notes),
         )
+
+
+def _doubts(reason: Reason, taken: int, asked: int) -> list[str]:
+    """Return what is to be said where more was taken for noise than a survey ever holds."""
+    if reason not in NOISE or taken <= _MUCH_NOISE * asked:
+        return []
+    return [
+        f"took {taken} of {asked} points ({taken / asked:.0%}) for noise, far more than surveys "
+        "hold: the cloud may be too sparse for its radii. Look at them with --mark and loosen it."
+    ]
 
 
 def run_octree_voxel_grid(bench: Bench, params: OctreeVoxelGrid) -> None:
