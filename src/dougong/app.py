@@ -232,12 +232,14 @@ def run_project(
     *,
     lidar: Sequence[Path],
     photogrammetry: Sequence[Path],
+    full_resolution: bool,
     overwrite: bool,
     work: Path | None,
     memory_bytes: int | None,
     progress: Progress,
 ) -> Document:
     """Filter, register, merge and report a whole project into the folder `out`."""
+    from dougong.pipeline.full_resolution import refuse_full_disk
     from dougong.pipeline.memory import refuse_too_large
     from dougong.pipeline.outputs import refuse_existing, result_folder
     from dougong.pipeline.project import files_of, from_files, read_project
@@ -252,6 +254,11 @@ def run_project(
     folder = Path() if project is None else project.parent
     files = [file for entry in plan.cloud for file in files_of(entry, folder)]
     refuse_too_large(files, memory_bytes)
+    if full_resolution:
+        head = plan.project.model_copy(update={"full_resolution": True})
+        plan = plan.model_copy(update={"project": head})
+    if plan.project.full_resolution:
+        refuse_full_disk(files, out)
     _say_if_cold(progress)
     store = _store(out, work)
     with result_folder(out) as part:

@@ -17,6 +17,7 @@ def command(
     out: Path,
     lidar: Annotated[list[Path] | None, Parameter(negative="")] = None,
     photogrammetry: Annotated[list[Path] | None, Parameter(negative="")] = None,
+    full_resolution: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     common: Common = DEFAULT,
 ) -> int:
@@ -37,6 +38,8 @@ def command(
         A laser scan; may be given several times.
     photogrammetry
         A drone cloud; may be given several times.
+    full_resolution
+        Also write every input file, undecimated, in the frame of the reference, into full/.
     overwrite
         Replace a result that exists already.
     """
@@ -47,6 +50,7 @@ def command(
             out,
             lidar=lidar or (),
             photogrammetry=photogrammetry or (),
+            full_resolution=full_resolution,
             overwrite=overwrite,
             work=common.work,
             memory_bytes=common.memory_bytes(),
@@ -68,4 +72,11 @@ def _words(document: dict[str, Any], out: Path) -> str:
         f"merged {_text.count(merged['points'])} points of {', '.join(merged['clouds'])} "
         f"in {document['seconds']['total']:.1f} s; report: {out / 'report.html'}"
     )
+    full = document["full_resolution"]
+    if full is not None:
+        points = sum(file["points"] for file in full["files"])
+        parts.append(
+            f"full resolution: {_text.count(points)} points in {len(full['files'])} files in "
+            f"{out / 'full'}"
+        )
     return _text.join(*parts, _text.notes(document["notes"]))

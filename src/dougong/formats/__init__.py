@@ -4,7 +4,7 @@ Formats by suffix: in .las .laz .copc.laz .e57 .ply .pcd .xyz .pts .csv .txt .as
 .copc.laz .e57 .ply. The libraries behind them are loaded when a file is opened.
 """
 
-from dougong.formats.atomic import part_of
+from dougong.formats.atomic import copy_file, part_of
 from dougong.formats.check import check
 from dougong.formats.describe import describe
 from dougong.formats.faults import faults_of
@@ -31,6 +31,7 @@ __all__ = [
     "Written",
     "can_reissue",
     "check",
+    "copy_file",
     "describe",
     "faults_of",
     "is_same_crs",

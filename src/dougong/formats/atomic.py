@@ -15,6 +15,7 @@ from typing import IO, Any
 
 from dougong.errors import OutputError
 
+_COPY_BYTES = 8 << 20
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
@@ -141,6 +142,22 @@ def replacing(path: Path, *, expected_bytes: int) -> Iterator[Sink]:
             raise _explain(cause, path, expected_bytes) from error
         raise
     _sync_folder(path.parent)
+
+
+def copy_file(source: Path, output: Path) -> None:
+    """Copy a file byte by byte: all of it or nothing.
+
+    Raises
+    ------
+    OutputError
+        The disk is full, or the folder cannot be written to.
+    """
+    with (
+        source.open("rb") as file,
+        replacing(output, expected_bytes=source.stat().st_size) as sink,
+    ):
+        while piece := file.read(_COPY_BYTES):
+            sink.write(piece)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -29,8 +29,14 @@ class Source:
     filtered: Filtered
     points_in: int
     notes: tuple[str, ...]
+
     removed: Cloud
     """A sample of what the filters took out, see `removed_sample`."""
+
+    @property
+    def is_scan(self) -> bool:
+        """True: one scan of an E57 file, which moves by itself."""
+        return self.station >= 0 and hasattr(self.filtered.cloud.header, "station")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

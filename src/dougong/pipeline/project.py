@@ -22,6 +22,8 @@ class Head(Parameters):
     """Title of the report."""
     reference: str | None = None
     """Cloud in whose frame the result is; default: the first photogrammetry cloud, else lidar."""
+    full_resolution: bool = False
+    """Also write every input file, undecimated, in the frame of the reference."""
 
 
 class Entry(Parameters):

@@ -13,6 +13,7 @@ import numpy as np
 from dougong.cloud import Cloud
 from dougong.filters.selection import Reason
 from dougong.formats import write, write_merged
+from dougong.pipeline.full_resolution import Place, full_notes, write_full_resolution
 from dougong.pipeline.loading import Loader, Mover
 from dougong.pipeline.outputs import write_json
 from dougong.pipeline.progress import Progress
@@ -23,6 +24,7 @@ from dougong.pipeline.registrations import finite, to_document
 from dougong.pipeline.store import Store
 from dougong.registration import Register
 from dougong.registration.result import Registration
+from dougong.typing import Transform
 
 MERGED = "merged.copc.laz"
 REMOVED = "removed"
@@ -45,12 +47,18 @@ class Linked:
             return True
         return self.accepts_best and self.result.matrix is not None
 
+    @property
+    def matrix(self) -> Transform | None:
+        """(4, 4) from its file coordinates to the reference's; None where that is not sure."""
+        if self.result is None:
+            return np.eye(4)
+        return self.result.matrix if self.is_sure else None
+
     def in_reference(self, clouds: list[Cloud], reference: Cloud) -> list[Cloud]:
         """Return its `clouds` in the reference's frame; where that is not known, in their own."""
-        if self.result is None or not self.is_sure or self.result.matrix is None:
+        if self.result is None or self.matrix is None:
             return clouds
-        matrix, frame = self.result.matrix, reference.frame
-        return [cloud.moved(matrix, frame) for cloud in clouds]
+        return [cloud.moved(self.matrix, reference.frame) for cloud in clouds]
 
 
 def run(
@@ -70,7 +78,7 @@ def run(
     folder : Path
         What the project's paths are relative to.
     out : Path
-        Gets merged.copc.laz, clouds/, removed/, registrations/ and result.json.
+        Gets merged.copc.laz, clouds/, removed/, registrations/, result.json and, if asked, full/.
     store : Store
         Keeps finished filter steps.
     progress : Progress
@@ -101,6 +109,18 @@ def run(
         merged = _write_clouds(linked, reference, out, progress)
     for document in documents:
         write_json(out / "registrations" / f"{document['source']}.json", document)
+    full = None
+    if project.project.full_resolution:
+        with clock.measure("full_resolution"):
+            full = write_full_resolution(
+                _places(linked),
+                reference.clouds[0].frame,
+                out,
+                reference=reference.name,
+                inputs=loader.inputs,
+                shown=shown,
+                progress=progress,
+            )
     statuses = [document["status"] for document in documents] or ["ok"]
     result: dict[str, Any] = {
         "status": min(statuses, key=_WORST.index),
@@ -110,6 +130,7 @@ def run(
         "clouds": [_cloud_document(link, loader) for link in linked],
         "registrations": documents,
         "merged": merged,
+        "full_resolution": full,
         "seconds": {**clock.seconds, "total": clock.total()},
         "peak_memory_bytes": peak_memory_bytes(),
         "finished_utc": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -117,11 +138,28 @@ def run(
         "software": software(),
         "parameters": _parameters(project, shown),
         "inputs": list(loader.inputs.values()),
-        "notes": _notes(linked),
+        "notes": [*_notes(linked), *full_notes(full)],
     }
     result = finite(result)
     write_json(out / "result.json", result)
     return result
+
+
+def _places(linked: Sequence[Linked]) -> list[Place]:
+    """Return where each file, or each scan that moves by itself, goes."""
+    return [
+        Place(
+            mover=link.mover.name,
+            entry=link.mover.entry,
+            file=source.file,
+            # Scans without points are not among the stations; the header counts them.
+            station=source.filtered.cloud.header.station if source.is_scan else -1,
+            status="reference" if link.result is None else link.result.status,
+            matrix=link.matrix,
+        )
+        for link in linked
+        for source in link.mover.sources
+    ]
 
 
 def _parameters(project: Project, shown: Callable[[Path], str]) -> dict[str, Any]:
