@@ -240,7 +240,7 @@ def run_project(
 ) -> Document:
     """Filter, register, merge and report a whole project into the folder `out`."""
     from dougong.pipeline.full_resolution import refuse_full_disk
-    from dougong.pipeline.memory import refuse_too_large
+    from dougong.pipeline.memory import Room, refuse_too_large
     from dougong.pipeline.outputs import refuse_existing, result_folder
     from dougong.pipeline.project import files_of, from_files, read_project
     from dougong.pipeline.run import run
@@ -252,17 +252,21 @@ def run_project(
     refuse_existing([out / "result.json"], overwrite)
     plan = from_files(lidar, photogrammetry) if project is None else read_project(project)
     folder = Path() if project is None else project.parent
-    files = [file for entry in plan.cloud for file in files_of(entry, folder)]
-    refuse_too_large(files, memory_bytes)
+    # Laser scans that do not fit are decimated on tiles; a drone's cloud has no such filter.
+    files = {file: entry.kind for entry in plan.cloud for file in files_of(entry, folder)}
+    whole = [file for file, kind in files.items() if kind == "photogrammetry"]
+    refuse_too_large(whole, memory_bytes)
     if full_resolution:
         head = plan.project.model_copy(update={"full_resolution": True})
         plan = plan.model_copy(update={"project": head})
     if plan.project.full_resolution:
-        refuse_full_disk(files, out)
+        refuse_full_disk(list(files), out)
     _say_if_cold(progress)
     store = _store(out, work)
     with result_folder(out) as part:
-        document = run(plan, folder, part, store=store, progress=progress)
+        document = run(
+            plan, folder, part, store=store, progress=progress, room=Room.of(memory_bytes)
+        )
         _build_report(part, progress)
     store.finish()
     return document

@@ -4,7 +4,7 @@ METHOD.md 1.1. Kept points keep every attribute; which one is kept depends only 
 on their order. Kernels are imported when called: the model loads without Numba.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,6 +19,9 @@ from dougong.threads import for_blocks
 from dougong.typing import Index, Mask, Points
 
 KIND: Literal["local", "two-pass", "global"] = "two-pass"
+
+Blocks = Callable[[], Iterable[Points]]
+"""Yields a cloud block by block, from its beginning at every call."""
 
 _TRIM = 0.005
 """Share of the points at each end of an axis that may be too far off to shape the root cube."""
@@ -70,23 +73,49 @@ def robust_box(points: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]
     than the longest side of the box of the others beyond that box. O(n), whatever the order.
     Below five points there are no suspects.
     """
-    n = len(points)
-    suspects = max(1, int(n * _TRIM)) if n > 4 else 0
-    low, high = points.min(axis=0), points.max(axis=0)
-    if suspects == 0 or _has_full_ends(points, low, high, suspects):
+    return robust_box_of(lambda: (points,), len(points))
+
+
+def robust_box_of(blocks: Blocks, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the `robust_box` of a cloud that comes in blocks, passed over two to four times.
+
+    Parameters
+    ----------
+    blocks : callable
+        Returns the blocks (m, 3), metres, from the first one; called once per pass.
+    count : int
+        Points in all blocks, at least 1. Memory: 48 bytes per suspect, so 0.5 bytes per point.
+    """
+    suspects = max(1, int(count * _TRIM)) if count > 4 else 0
+    low, high = _corners(blocks)
+    if suspects == 0 or _has_full_ends(blocks, low, high, suspects):
         return low, high
-    parted = np.partition(points, [suspects, n - 1 - suspects], axis=0)
-    low, high = parted[suspects], parted[n - 1 - suspects]
-    reach = float((high - low).max())
-    is_near = ((points >= low - reach) & (points <= high + reach)).all(axis=1)
-    if not is_near.any():
-        return points.min(axis=0), points.max(axis=0)
-    near = points[is_near]
-    return near.min(axis=0), near.max(axis=0)
+    inner_low, inner_high = _inner_corners(blocks, suspects)
+    reach = float((inner_high - inner_low).max())
+    near_low, near_high = _corners(blocks, (inner_low - reach, inner_high + reach))
+    return (near_low, near_high) if np.isfinite(near_low).all() else (low, high)
+
+
+def _corners(
+    blocks: Blocks, within: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the corners of the box of all points, or of those `within` two corners (inclusive).
+
+    Infinite where there are none.
+    """
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for block in blocks():
+        points = block
+        if within is not None:
+            points = block[((block >= within[0]) & (block <= within[1])).all(axis=1)]
+        if len(points):
+            low = np.minimum(low, points.min(axis=0))
+            high = np.maximum(high, points.max(axis=0))
+    return low, high
 
 
 def _has_full_ends(
-    points: Points, low: NDArray[np.float64], high: NDArray[np.float64], suspects: int
+    blocks: Blocks, low: NDArray[np.float64], high: NDArray[np.float64], suspects: int
 ) -> bool:
     """Say whether counting alone proves that no point of the box is far.
 
@@ -94,16 +123,39 @@ def _has_full_ends(
     the others' box is at least that third long and no suspect is further from it.
     """
     third = float((high - low).max()) / 3.0
-    return all(
-        np.count_nonzero(points[:, axis] <= low[axis] + third) > suspects
-        and np.count_nonzero(points[:, axis] >= high[axis] - third) > suspects
-        for axis in range(3)
-    )
+    at_low, at_high = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    for block in blocks():
+        for axis in range(3):
+            at_low[axis] += np.count_nonzero(block[:, axis] <= low[axis] + third)
+            at_high[axis] += np.count_nonzero(block[:, axis] >= high[axis] - third)
+    return bool((at_low > suspects).all() and (at_high > suspects).all())
+
+
+def _inner_corners(
+    blocks: Blocks, suspects: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return, per axis, the coordinate behind the `suspects` lowest and before the highest."""
+    lowest: list[NDArray[np.float64]] = [np.empty(0)] * 3
+    highest: list[NDArray[np.float64]] = [np.empty(0)] * 3
+    held = suspects + 1
+    for block in blocks():
+        for axis in range(3):
+            values = block[:, axis]
+            below = np.concatenate((lowest[axis], values))
+            above = np.concatenate((highest[axis], values))
+            lowest[axis] = np.partition(below, suspects)[:held] if len(below) > held else below
+            highest[axis] = np.partition(above, -held)[-held:] if len(above) > held else above
+    return np.array([v.max() for v in lowest]), np.array([v.min() for v in highest])
 
 
 def root_cube(points: Points, params: OctreeVoxelGrid) -> Root:
     """Return the root cube of `points` (n, 3), n >= 1, and the edge of a leaf under `params`."""
-    low, high = robust_box(points)
+    return root_cube_of(lambda: (points,), len(points), params)
+
+
+def root_cube_of(blocks: Blocks, count: int, params: OctreeVoxelGrid) -> Root:
+    """Return the `root_cube` of a cloud that comes in blocks (see `robust_box_of`)."""
+    low, high = robust_box_of(blocks, count)
     edge = float((high - low).max())
     if params.voxel_m is not None:
         return Root(low, edge, params.voxel_m)

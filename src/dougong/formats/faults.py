@@ -42,6 +42,11 @@ def copies_among(hashes: NDArray[np.uint64]) -> int:
     return int((hashes[1:] == hashes[:-1]).sum())
 
 
+def copies_in(xyz: Points) -> int:
+    """Return how many of the points (n, 3) lie exactly on another one."""
+    return copies_among(coordinate_hashes(xyz))
+
+
 def robust_box(sample: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the box of the middle 98 % grown on all sides by ten times its longest edge."""
     low, high = np.quantile(sample, [0.01, 0.99], axis=0)
@@ -90,22 +95,46 @@ def faults_of(cloud: Cloud) -> tuple[str, ...]:
     """Return what is wrong with `cloud` and was handled: duplicates, far points, units, no CRS."""
     if not len(cloud):
         return ()
+    sample = cloud.xyz[:: sample_step(len(cloud))]
+    return faults_in_words(
+        cloud.frame,
+        points=len(cloud),
+        copies=copies_in(cloud.xyz),
+        far=points_beyond(cloud.xyz, *robust_box(sample)),
+        sample=sample,
+    )
+
+
+def sample_step(points: int) -> int:
+    """Return so that every so many-th point of a cloud is in its sample."""
+    return max(1, points // SAMPLE)
+
+
+def faults_in_words(
+    frame: Frame, *, points: int, copies: int, far: int, sample: Points
+) -> tuple[str, ...]:
+    """Return the faults of a cloud of so many `points`, counted, in words.
+
+    Parameters
+    ----------
+    frame : Frame
+    copies, far : int
+        Points that lie exactly on another one, and far from all others.
+    sample : ndarray, shape (m, 3)
+        Local metres.
+    """
     found = []
-    if cloud.frame.crs is None:
+    if frame.crs is None:
         found.append("no coordinate reference system is named; its numbers are taken as metres.")
-    copies = copies_among(coordinate_hashes(cloud.xyz))
     if copies:
-        found.append(f"{copies:,} of {len(cloud):,} points lie exactly on another one.")
-    sample = cloud.xyz[:: max(1, len(cloud) // SAMPLE)]
-    low, high = robust_box(sample)
-    far = _beyond(cloud.xyz, low, high)
+        found.append(f"{copies:,} of {points:,} points lie exactly on another one.")
     if far:
-        found.append(f"{far:,} of {len(cloud):,} points lie far from all others.")
-    suspicion = unit_suspicion(sample, cloud.frame)
+        found.append(f"{far:,} of {points:,} points lie far from all others.")
+    suspicion = unit_suspicion(sample, frame)
     return (*found, suspicion) if suspicion else tuple(found)
 
 
-def _beyond(xyz: Points, low: Any, high: Any) -> int:
+def points_beyond(xyz: Points, low: Any, high: Any) -> int:
     """Return how many points lie outside a box."""
     if (xyz.min(axis=0) >= low).all() and (xyz.max(axis=0) <= high).all():
         return 0

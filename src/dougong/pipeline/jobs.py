@@ -8,6 +8,7 @@ from typing import Any
 
 from dougong.cloud import Cloud, Frame
 from dougong.errors import InputError
+from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
 from dougong.filters.selection import Reason
 from dougong.formats import (
     WRITABLE,
@@ -23,18 +24,31 @@ from dougong.formats import (
 from dougong.params import Parameters
 from dougong.pipeline.guess import guess_kind
 from dougong.pipeline.marking import GROUND_CLASS, marked, with_classes
-from dougong.pipeline.memory import refuse_too_large
+from dougong.pipeline.memory import Room, refuse_too_large
 from dougong.pipeline.outputs import refuse_existing, watched, write_json
 from dougong.pipeline.pairs import read_pairs
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import stem
 from dougong.pipeline.provenance import Clock, peak_memory_bytes, sha256, software
-from dougong.pipeline.recipes import LidarRecipe, PhotogrammetryRecipe, Recipe, filter_cloud
+from dougong.pipeline.recipes import (
+    LidarRecipe,
+    PhotogrammetryRecipe,
+    Recipe,
+    filter_cloud,
+    lidar_after_grid,
+)
 from dougong.pipeline.registering import register
 from dougong.pipeline.registrations import finite, read_registration, to_document
 from dougong.pipeline.settings import parse_overrides, updated, validated
 from dougong.pipeline.single import filter_name, filter_single, single_fields, single_parameters
 from dougong.pipeline.steps import Filtered
+from dougong.pipeline.tiled import (
+    FilteredOnTiles,
+    GridFirst,
+    filter_chunks,
+    is_too_large,
+    stations_of,
+)
 from dougong.registration import Register
 from dougong.typing import Kind
 
@@ -54,6 +68,17 @@ class FilterJob:
         assert self.kind is not None
         recipe = Recipe().model_copy(update={self.kind: self.params})
         return filter_cloud(cloud, self.kind, recipe, progress)
+
+    def grid_first(self) -> GridFirst | None:
+        """Return the job as tiles can do it, or None where it does not begin with a voxel grid."""
+        if isinstance(self.params, OctreeVoxelGrid):
+            return GridFirst(grid=self.params, after=lambda _: None)
+        if self.only is None and isinstance(self.params, LidarRecipe):
+            recipe = self.params
+            return GridFirst(
+                grid=recipe.octree_voxel_grid, after=lambda bench: lidar_after_grid(bench, recipe)
+            )
+        return None
 
 
 def filter_job(kind: Kind | None, only: str | None, settings: Sequence[str]) -> FilterJob:
@@ -132,30 +157,39 @@ def filter_file(
     """
     books = output.with_name(output.name + ".json")
     refuse_output(input, output, [output, books], overwrite)
-    refuse_too_large([input], memory_bytes)
     clock = Clock()
     progress.stage(f"reading {input.name}")
     with clock.measure("read"):
         digest = sha256(input)
-        cloud = read(input)
-        faults = faults_of(cloud)
-    with clock.measure("filter"):
-        filtered = job.run(cloud, progress)
-    result = _chosen(job, cloud, filtered, mark)
+    room, tiled = Room.of(memory_bytes), job.grid_first()
+    if tiled is not None and not mark and is_too_large(input, room, 0):
+        progress.note(f"{input.name} is larger than memory: its voxel grid runs on tiles")
+        with clock.measure("filter"):
+            found = _filtered_on_tiles(input, tiled, room, output.parent, progress)
+        filtered, noticed, result = found.filtered, found.notes, found.filtered.cloud
+    else:
+        refuse_too_large([input], memory_bytes)
+        with clock.measure("read"):
+            cloud = read(input)
+            noticed = (*cloud.notes, *faults_of(cloud))
+        with clock.measure("filter"):
+            filtered = job.run(cloud, progress)
+        result = _chosen(job, cloud, filtered, mark)
+    points_in = len(filtered.codes)
     progress.stage(f"writing {output.name}")
     with watched(output, books):
         with clock.measure("write"):
             written = write(result, output, overwrite=overwrite)
         document: dict[str, Any] = {
-            "input": {"path": str(input), "sha256": digest, "points": len(cloud)},
+            "input": {"path": str(input), "sha256": digest, "points": points_in},
             "output": str(output),
             "kind": job.kind,
             "only": job.only,
             "is_marked": mark,
-            "points_in": len(cloud),
+            "points_in": points_in,
             "points_kept": len(filtered.cloud),
             "points_written": len(result),
-            "reduction": 1.0 - len(filtered.cloud) / len(cloud),
+            "reduction": 1.0 - len(filtered.cloud) / points_in,
             "stages": [
                 {
                     "name": stage.name,
@@ -169,7 +203,7 @@ def filter_file(
             "reasons": reason_table(filtered),
             "ground_points": int(filtered.is_ground.sum()),
             "parameters": job.params.model_dump(mode="json"),
-            "notes": [*cloud.notes, *faults, *filtered.notes, *written.notes],
+            "notes": [*noticed, *filtered.notes, *written.notes],
             "seconds": {**clock.seconds, "total": clock.total()},
             "peak_memory_bytes": peak_memory_bytes(),
             "software": software(),
@@ -177,6 +211,21 @@ def filter_file(
         document = finite(document)
         write_json(books, document)
     return document
+
+
+def _filtered_on_tiles(
+    input: Path, job: GridFirst, room: Room, scratch: Path, progress: Progress
+) -> FilteredOnTiles:
+    (chunks,) = stations_of(input, split=False)
+    return filter_chunks(
+        chunks,
+        job,
+        points=describe(input).points,
+        room=room,
+        waiting=0,
+        scratch=scratch,
+        progress=progress,
+    )
 
 
 def reason_table(filtered: Filtered) -> dict[str, dict[str, int]]:

@@ -1,7 +1,7 @@
 """From a project's entries to the clouds that move: read, filtered, named."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +9,17 @@ import numpy as np
 
 from dougong.cloud import Cloud
 from dougong.errors import FrameError
-from dougong.formats import faults_of, is_same_crs, read, read_stations
+from dougong.filters.selection import Reason
+from dougong.formats import describe, faults_of, is_same_crs, read, read_stations
+from dougong.pipeline.memory import Room
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Entry, files_of
 from dougong.pipeline.provenance import Clock, sha256
-from dougong.pipeline.recipes import Recipe, filter_cloud
+from dougong.pipeline.recipes import Recipe, filter_cloud, lidar_after_grid
 from dougong.pipeline.removed import removed_sample
 from dougong.pipeline.steps import Filtered
 from dougong.pipeline.store import Store
+from dougong.pipeline.tiled import GridFirst, filter_chunks, is_too_large, stations_of, undecimated
 from dougong.typing import Kind
 
 
@@ -99,7 +102,10 @@ class Loader:
     progress: Progress
     clock: Clock
     shown: Callable[[Path], str]
-    inputs: dict[Path, dict[str, Any]]
+    room: Room
+    inputs: dict[Path, dict[str, Any]] = field(default_factory=dict)
+    held: dict[Path, int] = field(default_factory=dict)
+    """Filtered points of each file, which wait in memory."""
 
     def movers(self, entry: Entry) -> list[Mover]:
         """Return what moves as one of a project's cloud, read and filtered."""
@@ -123,38 +129,91 @@ class Loader:
         self.progress.stage(f"reading {file.name}")
         with self.clock.measure("read"):
             digest = sha256(file)
+        waiting = sum(self.held.values())
+        if entry.kind == "lidar" and is_too_large(file, self.room, waiting):
+            found = self._on_tiles(entry, file, digest)
+        else:
+            found = self._whole(entry, file, digest)
+        self.inputs[file] = {"path": self.shown(file), "sha256": digest, "points": 0}
+        for source in found:
+            self.inputs[file]["points"] += source.points_in
+            self.held[file] = self.held.get(file, 0) + len(source.filtered.cloud)
+            yield source
+
+    def _whole(self, entry: Entry, file: Path, digest: str) -> Iterator[Source]:
+        """Read the file, then filter its clouds one by one."""
+        with self.clock.measure("read"):
             clouds = [read(file)] if entry.registered else read_stations(file)
-        self.inputs[file] = {
-            "path": self.shown(file),
-            "sha256": digest,
-            "points": sum(len(cloud) for cloud in clouds),
-        }
         for station in range(len(clouds)):
             # Each raw cloud is let go as soon as it is filtered.
             cloud, clouds[station] = clouds[station], clouds[station].select(np.arange(0))
-            station_of = station if not entry.registered else -1
-            faults = faults_of(cloud)
+            key = self._key(entry, digest, station)
+            books = self.store.load(key)
+            if books is not None and len(books.codes) == len(cloud):
+                self._say_known(cloud.name)
+                kept = cloud.select(np.flatnonzero(books.codes == Reason.KEPT))
+                removed = removed_sample(cloud, books.codes)
+                yield self._source(entry, file, station, books.on(kept), books.noticed, removed)
+                continue
             with self.clock.measure("filter"):
-                filtered = self._filtered(cloud, entry.kind, digest, station_of)
-            yield Source(
-                file=file,
-                station=station_of,
-                filtered=filtered,
-                points_in=len(cloud),
-                removed=removed_sample(cloud, filtered.codes),
-                notes=(
-                    *(f"{file.name}: {note}" for note in (*cloud.notes, *faults)),
-                    *filtered.notes,
-                ),
-            )
+                noticed = (*cloud.notes, *faults_of(cloud))
+                filtered = filter_cloud(cloud, entry.kind, self.recipe, self.progress)
+            self.store.save(key, filtered, noticed)
+            removed = removed_sample(cloud, filtered.codes)
+            yield self._source(entry, file, station, filtered, noticed, removed)
 
-    def _filtered(self, cloud: Cloud, kind: Kind, digest: str, station: int) -> Filtered:
-        params = self.recipe.lidar if kind == "lidar" else self.recipe.photogrammetry
-        key = self.store.key(digest, station, kind, params)
-        known = self.store.load(key, cloud)
-        if known is not None:
-            self.progress.note(f"{cloud.name}: filtered in an earlier run; not filtered again")
-            return known
-        filtered = filter_cloud(cloud, kind, self.recipe, self.progress)
-        self.store.save(key, filtered)
-        return filtered
+    def _on_tiles(self, entry: Entry, file: Path, digest: str) -> Iterator[Source]:
+        """Filter the clouds of a file that does not fit in memory."""
+        self.progress.note(f"{file.name} is larger than memory: its voxel grid runs on tiles")
+        recipe = self.recipe.lidar
+        job = GridFirst(
+            grid=recipe.octree_voxel_grid, after=lambda bench: lidar_after_grid(bench, recipe)
+        )
+        points = describe(file).points
+        for station, chunks in enumerate(stations_of(file, split=not entry.registered)):
+            key = self._key(entry, digest, station)
+            books = self.store.load(key)
+            if books is not None:
+                thinned, codes = undecimated(chunks, books.codes)
+                self._say_known(thinned.name)
+                filtered = books.on(thinned.select(np.flatnonzero(codes == Reason.KEPT)))
+                removed = removed_sample(thinned, codes)
+                yield self._source(entry, file, station, filtered, books.noticed, removed)
+                continue
+            with self.clock.measure("filter"):
+                found = filter_chunks(
+                    chunks,
+                    job,
+                    points=points,
+                    room=self.room,
+                    waiting=sum(self.held.values()),
+                    scratch=self.store.folder,
+                    progress=self.progress,
+                )
+            self.store.save(key, found.filtered, found.notes)
+            yield self._source(entry, file, station, found.filtered, found.notes, found.removed)
+
+    def _key(self, entry: Entry, digest: str, station: int) -> str:
+        params = self.recipe.lidar if entry.kind == "lidar" else self.recipe.photogrammetry
+        return self.store.key(digest, -1 if entry.registered else station, entry.kind, params)
+
+    def _say_known(self, name: str) -> None:
+        self.progress.note(f"{name}: filtered in an earlier run; not filtered again")
+
+    def _source(
+        self,
+        entry: Entry,
+        file: Path,
+        station: int,
+        filtered: Filtered,
+        noticed: Iterable[str],
+        removed: Cloud,
+    ) -> Source:
+        return Source(
+            file=file,
+            station=-1 if entry.registered else station,
+            filtered=filtered,
+            points_in=len(filtered.codes),
+            removed=removed,
+            notes=(*(f"{file.name}: {note}" for note in noticed), *filtered.notes),
+        )

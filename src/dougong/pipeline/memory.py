@@ -1,6 +1,8 @@
-"""``--memory``: a job that cannot fit is refused before it starts."""
+"""``--memory``: what fits is done in memory, a larger laser scan on tiles, the rest is refused."""
 
+import os
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 from dougong.errors import InputError
@@ -12,6 +14,88 @@ from dougong.formats import describe
 BASE_BYTES = 800_000_000
 BYTES_PER_POINT = 230
 BYTES_PER_WAITING_POINT = 110
+_BYTES_PER_TILE_POINT = 250
+_BYTES_PER_BOOKED_POINT = 2
+"""Of a cloud on tiles, only the reason and the ground class of every point are held."""
+_LEAST_TILE_POINTS = 100_000
+_MOST_TILE_POINTS = 20_000_000
+"""Larger tiles gain nothing."""
+_SHARE = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """How much memory a job may use."""
+
+    bytes: float
+    is_asked: bool
+    """True: the user said so. False: most of what is free now, to choose a way, not to refuse."""
+
+    @classmethod
+    def of(cls, memory_bytes: int | None) -> "Room":
+        """Return the room of ``--memory``, or four fifths of what is free on this machine."""
+        if memory_bytes is not None:
+            return cls(float(memory_bytes), True)
+        return cls(_SHARE * _free_bytes(), False)
+
+    def holds(self, points: int, waiting: int = 0) -> bool:
+        """Say whether a cloud of `points` fits beside clouds of `waiting` points in all."""
+        return estimated_bytes([points, waiting]) <= self.bytes
+
+    def tile_points(self, points: int, waiting: int) -> int:
+        """Return how many points a tile of a cloud of `points` may have.
+
+        Raises
+        ------
+        InputError
+            There is no room for any tile worth the name.
+        """
+        taken = BASE_BYTES + waiting * BYTES_PER_WAITING_POINT + points * _BYTES_PER_BOOKED_POINT
+        left = max(self.bytes - taken, 0.0)
+        most = int(left / _BYTES_PER_TILE_POINT)
+        if most < _LEAST_TILE_POINTS:
+            need = taken + _LEAST_TILE_POINTS * _BYTES_PER_TILE_POINT
+            msg = (
+                f"{points:,} points need about {need / 1e9:.1f} GB even on tiles, more than "
+                f"{self._name()}. Raise it, or give the clouds one by one."
+            )
+            raise InputError(msg)
+        return min(most, _MOST_TILE_POINTS)
+
+    def refuse_kept(self, kept: int, waiting: int, name: str) -> None:
+        """Refuse to go on with a decimated cloud that is still too large for what was asked.
+
+        Raises
+        ------
+        InputError
+            It is.
+        """
+        if self.is_asked and not self.holds(kept, waiting):
+            need = estimated_bytes([kept, waiting])
+            msg = (
+                f"{name}: {kept:,} points are left after the voxel grid and need about "
+                f"{need / 1e9:.1f} GB, more than {self._name()}. Raise it, or thin the cloud "
+                "more with octree_voxel_grid.voxel_m."
+            )
+            raise InputError(msg)
+
+    def _name(self) -> str:
+        asked = f"--memory {self.bytes / 1e9:.1f} GB"
+        return asked if self.is_asked else f"the {self.bytes / 1e9:.1f} GB that may be used"
+
+
+def _free_bytes() -> float:
+    """Return how much memory is free on this machine; infinity where it does not tell."""
+    try:
+        with Path("/proc/meminfo").open(encoding="ascii") as file:
+            lines = dict(line.split(":", 1) for line in file)
+        return 1024.0 * int(lines["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        pass
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):
+        return float("inf")
 
 
 def estimated_bytes(points: Iterable[int]) -> int:

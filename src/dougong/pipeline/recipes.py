@@ -117,6 +117,11 @@ def filter_cloud(
 
 def _lidar(bench: Bench, recipe: LidarRecipe) -> None:
     run_octree_voxel_grid(bench, recipe.octree_voxel_grid)
+    lidar_after_grid(bench, recipe)
+
+
+def lidar_after_grid(bench: Bench, recipe: LidarRecipe) -> None:
+    """Run what follows the voxel grid on a laser scan's decimated points."""
     run_low_outliers(bench, recipe.low_outliers)
     run_cloth(bench, recipe.cloth_simulation)
     left = bench.left()

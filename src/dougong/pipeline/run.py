@@ -15,6 +15,7 @@ from dougong.filters.selection import Reason
 from dougong.formats import write, write_merged
 from dougong.pipeline.full_resolution import Place, full_notes, write_full_resolution
 from dougong.pipeline.loading import Loader, Mover
+from dougong.pipeline.memory import Room
 from dougong.pipeline.outputs import write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Project
@@ -68,6 +69,7 @@ def run(
     *,
     store: Store,
     progress: Progress,
+    room: Room | None = None,
     shown: Callable[[Path], str] = str,
 ) -> dict[str, Any]:
     """Run a whole project and write its files into the empty folder `out`.
@@ -82,6 +84,8 @@ def run(
     store : Store
         Keeps finished filter steps.
     progress : Progress
+    room : Room, optional
+        Memory that may be used; a laser scan that does not fit is decimated on tiles.
     shown : callable
         How a path is named in the results.
 
@@ -98,7 +102,7 @@ def run(
         progress=progress,
         clock=clock,
         shown=shown,
-        inputs={},
+        room=room or Room.of(None),
     )
     movers = [mover for entry in project.cloud for mover in loader.movers(entry)]
     reference = next(mover for mover in movers if mover.entry == project.reference())

@@ -8,11 +8,13 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 import dougong
 from dougong.cloud import Cloud
@@ -21,6 +23,28 @@ from dougong.params import Parameters
 from dougong.pipeline.outputs import write_text
 from dougong.pipeline.steps import Filtered, StageCount
 from dougong.typing import Kind
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Books:
+    """What a finished step decided about every point of its input; see `Filtered`."""
+
+    codes: NDArray[np.uint8]
+    ground_class: NDArray[np.uint8]
+    stages: tuple[StageCount, ...]
+    notes: tuple[str, ...]
+    noticed: tuple[str, ...]
+    """What reading the input said."""
+
+    def on(self, kept: Cloud) -> Filtered:
+        """Return the finished step with the points that it kept."""
+        return Filtered(
+            cloud=kept,
+            codes=self.codes,
+            ground_class=self.ground_class,
+            stages=self.stages,
+            notes=self.notes,
+        )
 
 
 class Store:
@@ -35,8 +59,8 @@ class Store:
         facts = [dougong.__version__, digest, station, kind, params.model_dump(mode="json")]
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:32]
 
-    def load(self, key: str, cloud: Cloud) -> Filtered | None:
-        """Return the finished step on `cloud`, or None."""
+    def load(self, key: str) -> Books | None:
+        """Return the books of a finished step, or None."""
         books = self.folder / f"{key}.json"
         arrays = self.folder / f"{key}.npz"
         # The books are written last: where they are, the arrays are whole.
@@ -45,17 +69,15 @@ class Store:
         told = json.loads(books.read_text(encoding="utf-8"))
         with np.load(arrays) as stored:
             codes, ground = stored["codes"], stored["ground_class"]
-        if len(codes) != len(cloud):
-            return None
-        return Filtered(
-            cloud=cloud.select(np.flatnonzero(codes == 0)),
+        return Books(
             codes=codes,
             ground_class=ground,
             stages=tuple(StageCount(**stage) for stage in told["stages"]),
             notes=tuple(told["notes"]),
+            noticed=tuple(told["noticed"]),
         )
 
-    def save(self, key: str, filtered: Filtered) -> None:
+    def save(self, key: str, filtered: Filtered, noticed: Sequence[str]) -> None:
         """Keep a finished step.
 
         Raises
@@ -79,6 +101,7 @@ class Store:
         books = {
             "stages": [asdict(stage) for stage in filtered.stages],
             "notes": list(filtered.notes),
+            "noticed": list(noticed),
         }
         write_text(self.folder / f"{key}.json", json.dumps(books))
 

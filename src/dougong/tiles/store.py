@@ -1,0 +1,129 @@
+"""Tiles on disk: rows of points in Arrow files that grow by appending.
+
+A file is a chain of Arrow streams, one per append, so any number of tiles can grow at once without
+being open, and a file is read back in the pieces it was written in.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from dougong.cloud import Records
+from dougong.errors import OutputError
+from dougong.typing import Index, Points
+
+_OPTIONS = pa.ipc.IpcWriteOptions(compression="lz4")
+
+
+class Rows(NamedTuple):
+    """Some points of a cloud."""
+
+    row: Index
+    """(n,) their places in the cloud."""
+    xyz: Points
+    """(n, 3) local metres."""
+    records: Records
+    """(n,) the input's own records."""
+
+    def take(self, chosen: Any) -> "Rows":
+        """Return the `chosen` of them: a mask or places."""
+        return Rows(self.row[chosen], self.xyz[chosen], self.records[chosen])
+
+
+class RowFile:
+    """A file of rows. Nothing of it is held."""
+
+    def __init__(self, path: Path, layout: np.dtype[Any]) -> None:
+        self.path = path
+        self.layout = layout
+
+    def append(self, rows: Rows) -> None:
+        """Write `rows` behind those that are there.
+
+        Raises
+        ------
+        OutputError
+            The disk is full, or the folder cannot be written.
+        """
+        batch = _to_batch(rows)
+        with (
+            _told(self.path),
+            self.path.open("ab") as file,
+            pa.ipc.new_stream(file, batch.schema, options=_OPTIONS) as writer,
+        ):
+            writer.write_batch(batch)
+
+    def pieces(self) -> Iterator[Rows]:
+        """Yield the rows in the pieces they were appended in."""
+        with self.path.open("rb") as file:
+            size = file.seek(0, 2)
+            file.seek(0)
+            while file.tell() < size:
+                yield from _read_stream(file, self.layout)
+
+    def read(self) -> Rows:
+        """Return all rows."""
+        return concatenate(list(self.pieces()))
+
+    def remove(self) -> None:
+        """Delete the file."""
+        self.path.unlink()
+
+
+def concatenate(parts: list[Rows]) -> Rows:
+    """Return the rows of at least one part as one."""
+    if len(parts) == 1:
+        return parts[0]
+    row, xyz, records = zip(*parts, strict=True)
+    return Rows(np.concatenate(row), np.concatenate(xyz), np.concatenate(records))
+
+
+def _to_batch(rows: Rows) -> pa.RecordBatch:
+    records = np.ascontiguousarray(rows.records)
+    width = records.dtype.itemsize
+    packed = pa.Array.from_buffers(
+        pa.binary(width), len(records), [None, pa.py_buffer(records.view(np.uint8))]
+    )
+    x, y, z = (pa.array(np.ascontiguousarray(rows.xyz[:, axis])) for axis in range(3))
+    return pa.record_batch([pa.array(rows.row), x, y, z, packed], names=list("nxyzp"))
+
+
+def _read_stream(file: IO[bytes], layout: np.dtype[Any]) -> Iterator[Rows]:
+    for batch in pa.ipc.open_stream(file):
+        columns = [batch.column(name).to_numpy(zero_copy_only=True) for name in "xyz"]
+        packed = batch.column("p")
+        start = packed.offset * layout.itemsize
+        data = packed.buffers()[1][start : start + len(packed) * layout.itemsize]
+        yield Rows(
+            row=batch.column("n").to_numpy(zero_copy_only=True),
+            xyz=np.stack(columns, axis=1),
+            records=np.frombuffer(data, dtype=layout),
+        )
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Say in one sentence why a tile could not be written."""
+    try:
+        yield
+    except OSError as error:
+        msg = (
+            f"{path.parent} could not be written: {error.strerror or error}. "
+            "Free some space or pass another --work."
+        )
+        raise OutputError(msg) from error
+
+
+def make_row_file(folder: Path) -> Callable[[str, np.dtype[Any]], RowFile]:
+    """Return a maker of new row files in `folder`, which is made where it is missing."""
+    with _told(folder / "tiles"):
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def make(name: str, layout: np.dtype[Any]) -> RowFile:
+        return RowFile(folder / f"{name}.arrows", layout)
+
+    return make

@@ -1,0 +1,163 @@
+"""Tiled work gives the points that whole work gives, whatever the tiles."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dougong.cli import call
+from dougong.cloud import Cloud
+from dougong.errors import OutputError
+from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid, robust_box
+from dougong.formats import faults_of, read, write
+from dougong.pipeline import memory
+from dougong.tiles.decimate import Spool, decimate
+from dougong.tiles.grid import TileGrid, grid_for, part
+from dougong.tiles.store import RowFile, Rows
+
+
+def site(count=30_000, seed=0, stray=True):
+    """A wall and ground with density 100:1, repeated places, and one point far away."""
+    rng = np.random.default_rng(seed)
+    wall = np.column_stack(
+        [rng.uniform(0, 8, count), 0.02 * rng.normal(size=count), 3 * rng.random(count) ** 3]
+    )
+    ground = np.column_stack([rng.uniform(-20, 20, (count // 4, 2)), np.zeros(count // 4)])
+    points = np.round(np.vstack([wall, ground, wall[:500]]), 3)
+    if stray:
+        points = np.vstack([points, [[1e6, -2e6, 40.0]]])
+    return Cloud.from_points(points, intensity=rng.integers(0, 9, len(points)).astype("<u2"))
+
+
+def pieces(cloud, size):
+    return (
+        cloud.select(np.arange(a, min(a + size, len(cloud)))) for a in range(0, len(cloud), size)
+    )
+
+
+@pytest.mark.parametrize("tile_points", [400, 5000, 10**9])
+@pytest.mark.parametrize("chunk", [777, 10**9])
+@pytest.mark.parametrize("params", [OctreeVoxelGrid(voxel_m=0.05), OctreeVoxelGrid(depth=9)])
+def test_tiles_keep_what_the_whole_keeps(tmp_path, params, chunk, tile_points):
+    cloud = site()
+    whole = octree_voxel_grid(cloud.xyz, params, records=cloud.records)
+    tiled = decimate(Spool(pieces(cloud, chunk), tmp_path), params, tile_points)
+    np.testing.assert_array_equal(tiled.row, np.flatnonzero(whole.is_kept))
+    np.testing.assert_array_equal(tiled.cloud.records, cloud.records[whole.is_kept])
+    np.testing.assert_array_equal(tiled.cloud.xyz, cloud.xyz[whole.is_kept])
+    np.testing.assert_array_equal(tiled.voxel_count, whole.attributes["voxel_count"][whole.is_kept])
+    assert tiled.points_in == len(cloud)
+    assert tiled.faults == faults_of(cloud)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_voxel_with_more_points_than_a_tile_may_hold_ends(tmp_path):
+    cloud = Cloud.from_points(np.full((5000, 3), 3.25))
+    tiled = decimate(Spool(pieces(cloud, 1000), tmp_path), OctreeVoxelGrid(), 100)
+    assert len(tiled.cloud) == 1
+    assert tiled.voxel_count.tolist() == [5000]
+
+
+def test_a_voxel_lies_in_one_tile():
+    points = site().xyz
+    grid = TileGrid(robust_box(points)[0], 0.05, 3)
+    parts = part(points, grid)
+    tile = np.empty(len(points), np.int64)
+    tile[parts.order] = np.repeat(np.arange(len(parts.tiles)), np.diff(parts.starts))
+    voxel = np.unique(np.floor((points - grid.low) / 0.05), axis=0, return_inverse=True)[1]
+    assert len(np.unique(np.column_stack([voxel, tile]), axis=0)) == voxel.max() + 1
+    for number in range(len(parts.tiles)):
+        own = parts.order[parts.starts[number] : parts.starts[number + 1]]
+        assert (np.diff(own) > 0).all()  # the cloud's order, so that ties are settled alike
+
+
+def test_children_halve_a_tile():
+    grid = grid_for(np.zeros(3), 100.0, 0.005, 10_000_000, 1_000_000)
+    assert 2**grid.level * 0.005 < 100.0
+    points = np.random.default_rng(0).uniform(0, 100, (1000, 3))
+    fine = part(points, grid.children()).tiles
+    coarse = part(points, grid).tiles
+    assert {tuple(t) for t in (fine >> 1)} == {tuple(t) for t in coarse}
+
+
+def test_rows_come_back_bit_for_bit(tmp_path):
+    cloud = site(300)
+    file = RowFile(tmp_path / "a.arrows", cloud.records.dtype)
+    for a, b in ((0, 100), (100, 101), (101, len(cloud))):
+        file.append(Rows(np.arange(a, b), cloud.xyz[a:b], cloud.records[a:b]))
+    back = file.read()
+    assert len(list(file.pieces())) == 3
+    np.testing.assert_array_equal(back.row, np.arange(len(cloud)))
+    np.testing.assert_array_equal(back.xyz, cloud.xyz)
+    assert back.records.tobytes() == cloud.records.tobytes()
+
+
+def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path):
+    cloud = site(100)
+    file = RowFile(tmp_path / "missing" / "a.arrows", cloud.records.dtype)
+    with pytest.raises(OutputError, match="could not be written"):
+        file.append(Rows(np.arange(len(cloud)), cloud.xyz, cloud.records))
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """A LAZ file of a wall, ground and noise that the whole recipe has something to do with."""
+    rng = np.random.default_rng(3)
+    noise = rng.uniform([-20, -20, -3], [20, 20, 12], (400, 3))
+    points = np.vstack([site(stray=False).xyz + [20.0, 20.0, 0.0], noise + [20, 20, 0]])
+    path = tmp_path / "scan.laz"
+    write(Cloud.from_points(points + [5e5, 4e6, 100.0]), path)
+    return path
+
+
+@pytest.fixture
+def little_room(monkeypatch):
+    """Room for 190 kB beside a base of nothing: tiles of some 400 points, and no limit behind them."""
+    monkeypatch.setattr(memory, "BASE_BYTES", 0)
+    monkeypatch.setattr(memory, "BYTES_PER_POINT", 5)
+    monkeypatch.setattr(memory, "BYTES_PER_WAITING_POINT", 1)
+    monkeypatch.setattr(memory, "_LEAST_TILE_POINTS", 100)
+
+
+VOXEL = "octree_voxel_grid.voxel_m=0.1"
+
+
+def filtered_by(path, out, *options):
+    call(["filter", str(path), str(out), "--set", VOXEL, "--quiet", *options])
+    return read(out), json.loads((out.parent / f"{out.name}.json").read_text())
+
+
+@pytest.mark.parametrize("what", [("--kind", "lidar"), ("--only", "octree_voxel_grid")])
+def test_filter_is_the_same_on_tiles(scan, tmp_path, little_room, what):
+    whole, said = filtered_by(scan, tmp_path / "whole.laz", *what, "--memory", "4GB")
+    tiled, told = filtered_by(scan, tmp_path / "tiled.laz", *what, "--memory", "190kB")
+    np.testing.assert_array_equal(tiled.records, whole.records)
+    for volatile in ("seconds", "peak_memory_bytes", "output"):
+        del said[volatile], told[volatile]
+    for stage in (*said["stages"], *told["stages"]):
+        del stage["seconds"]
+    assert told == said
+    assert not list(tmp_path.glob("tiles-*"))
+
+
+def test_run_is_the_same_on_tiles_and_goes_on_where_it_was(scan, tmp_path, little_room, capsys):
+    results = []
+    for name, room in (("whole", "4GB"), ("tiled", "190kB"), ("again", "190kB")):
+        work = tmp_path / ("work" if name != "whole" else "other")
+        tokens = ["run", "--lidar", str(scan), "--out", str(tmp_path / name), "--memory", room]
+        assert call([*tokens, "--work", str(work)]) == 0
+        results.append(json.loads((tmp_path / name / "result.json").read_text()))
+    said = capsys.readouterr().err
+    assert said.count("its voxel grid runs on tiles") == 2
+    assert said.count("not filtered again") == 1
+    assert len({result["result_hash"] for result in results}) == 1
+    assert results[0]["notes"] == results[1]["notes"] == results[2]["notes"]
+    assert results[1]["inputs"] == results[0]["inputs"]
+
+
+def test_a_grid_that_leaves_too_much_is_refused(scan, tmp_path, little_room, capsys, monkeypatch):
+    monkeypatch.setattr(memory, "BYTES_PER_POINT", 1000)
+    tokens = ["filter", str(scan), str(tmp_path / "out.laz"), "--kind", "lidar"]
+    assert call([*tokens, "--memory", "190kB"]) == 2
+    assert "points are left after the voxel grid" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scan.laz"]
