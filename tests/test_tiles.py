@@ -112,7 +112,7 @@ def scan(tmp_path):
 
 @pytest.fixture
 def little_room(monkeypatch):
-    """Room for 190 kB beside a base of nothing: tiles of some 400 points, and no limit behind them."""
+    """Make 190 kB enough for tiles of some 400 points."""
     monkeypatch.setattr(memory, "BASE_BYTES", 0)
     monkeypatch.setattr(memory, "BYTES_PER_POINT", 5)
     monkeypatch.setattr(memory, "BYTES_PER_WAITING_POINT", 1)
