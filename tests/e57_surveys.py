@@ -250,3 +250,4 @@ def _picture(image, images, index):
     blob.write(np.frombuffer(pixels, dtype="u1").copy(), 0, len(pixels))
     _integers(image, pinhole, imageWidth=16, imageHeight=16)
     _floats(image, pinhole, focalLength=0.02, pixelWidth=1e-5, pixelHeight=1e-5)
+    _floats(image, pinhole, principalPointX=8.0, principalPointY=8.0)
