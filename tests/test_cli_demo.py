@@ -73,7 +73,10 @@ def test_result_json_tells_counts_parameters_and_provenance(demo):
         kept = dougong.describe(out / "clouds" / f"{cloud['name']}.laz").points
         assert kept == cloud["points_out"] == cloud["stages"][-1]["points_out"]
         assert sum(cloud["reasons"].values()) == cloud["points_in"]
-    assert result["merged"]["points"] == sum(cloud["points_out"] for cloud in result["clouds"])
+    merged = result["merged"]
+    offered = sum(cloud["points_out"] for cloud in result["clouds"])
+    assert merged["points"] + merged["left_out"] == offered
+    assert merged["sources"]["lidar"]["left_out"] < 0.01 * offered < merged["left_out"]
     assert result["merged"]["source_ids"] == {"lidar": 1, "drone": 2}
     assert {"read", "filter", "register", "write", "total"} <= set(result["seconds"])
     assert result["peak_memory_bytes"] > 10**8

@@ -141,6 +141,15 @@ def test_coordinates_that_no_map_has_are_ground_metres_and_said():
     assert "site grid has coordinates of map size" in said
 
 
+def test_a_map_true_to_scale_leaves_scans_alone():
+    place = (500_000, 3_500_000, 20)
+    pair, said = decided(on((0, 0, 0), "scan", None), on(place, "drone", as_wkt("EPSG:4549")))
+    assert pair is None
+    assert "-5.5 ppm, too little to matter" in said
+    given, _ = decided(on((0, 0, 0), "scan", None), on(place, "drone", UTM), 0.999995)
+    assert given.factor == 0.999995
+
+
 def test_the_factor_can_be_given_and_switched_off():
     scan, drone = on((0, 0, 0), "scan", None), on(PLACE, "drone", UTM)
     assert decided(scan, drone, "off") == (

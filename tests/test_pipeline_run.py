@@ -86,12 +86,28 @@ def test_files_of_one_cloud_move_together(folder, capsys, monkeypatch):
     assert result["clouds"][0]["points_in"] == 12_000
     assert result["merged"]["source_ids"] == {"scans": 1, "map": 2}
     merged = dougong.read(folder / "out" / "merged.copc.laz")
-    assert len(merged) == sum(entry["points_out"] for entry in result["clouds"])
+    books = result["merged"]
+    offered = sum(entry["points_out"] for entry in result["clouds"])
+    assert len(merged) == books["points"] == offered - books["left_out"]
     source = merged.attribute("source_id")
     low = [merged.frame.to_file(merged.xyz[source == part]).min(axis=0) for part in (1, 2)]
     np.testing.assert_allclose(low[0], low[1], atol=0.1)
     both = dougong.read(folder / "out" / "clouds" / "scans.laz")
     assert len(both) == result["clouds"][0]["points_out"]
+
+
+def test_the_option_brings_every_point_back(folder, capsys, monkeypatch):
+    monkeypatch.setattr("dougong.pipeline.run.register", answer("ok"))
+    _, best = run(capsys, clouds(folder), "--out", folder / "best")
+    _, every = run(capsys, clouds(folder), "--out", folder / "all", "--merge", "all")
+    assert every["merged"]["left_out"] == 0 < best["merged"]["left_out"]
+    assert every["merged"]["points"] == sum(entry["points_out"] for entry in every["clouds"])
+    assert best["result_hash"] == every["result_hash"]
+    more = '[merge]\nmode = "all"\n'
+    _, by_file = run(capsys, clouds(folder, more=more), "--out", folder / "file")
+    assert by_file["merged"]["points"] == every["merged"]["points"]
+    page = (folder / "best" / "report.html").read_text()
+    assert f"{best['merged']['sources']['map']['left_out']:,} of map" in page
 
 
 def test_stations_that_are_not_registered_move_by_themselves(folder, capsys, monkeypatch):

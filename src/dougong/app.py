@@ -233,12 +233,16 @@ def run_project(
     lidar: Sequence[Path],
     photogrammetry: Sequence[Path],
     full_resolution: bool,
+    merge: str | None,
     overwrite: bool,
     work: Path | None,
     memory_bytes: int | None,
     progress: Progress,
 ) -> Document:
-    """Filter, register, merge and report a whole project into the folder `out`."""
+    """Filter, register, merge and report a whole project into the folder `out`.
+
+    `merge`, "best" or "all", takes the place of the project's ``merge.mode``.
+    """
     from dougong.pipeline.full_resolution import refuse_full_disk
     from dougong.pipeline.memory import Room, refuse_too_large
     from dougong.pipeline.outputs import refuse_existing, result_folder
@@ -251,6 +255,8 @@ def run_project(
     out = _named(out)
     refuse_existing([out / "result.json"], overwrite)
     plan = from_files(lidar, photogrammetry) if project is None else read_project(project)
+    if merge is not None:
+        plan = plan.model_copy(update={"merge": plan.merge.model_copy(update={"mode": merge})})
     folder = Path() if project is None else project.parent
     # Laser scans that do not fit are decimated on tiles; a drone's cloud has no such filter.
     files = {file: entry.kind for entry in plan.cloud for file in files_of(entry, folder)}

@@ -98,7 +98,7 @@ def _step_in(source: Frame, target: Frame, scale: float) -> tuple[float, float, 
     if source.step is None:
         return None
     finest = min(s * u for s, u in zip(source.step, source.unit_m, strict=True))
-    if scale < 1 - 1e-9:  # a mere rotation must not change the step's last digit
+    if scale < 0.99:  # neither a rotation nor a map's scale must cost the step a digit
         finest *= scale
     x, y, z = (finest / unit for unit in target.unit_m)
     return (x, y, z)

@@ -1,7 +1,7 @@
 """``dougong run``: the main job."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -18,6 +18,7 @@ def command(
     lidar: Annotated[list[Path] | None, Parameter(negative="")] = None,
     photogrammetry: Annotated[list[Path] | None, Parameter(negative="")] = None,
     full_resolution: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    merge: Literal["best", "all"] | None = None,
     overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     common: Common = DEFAULT,
 ) -> int:
@@ -40,6 +41,9 @@ def command(
         A drone cloud; may be given several times.
     full_resolution
         Also write every input file, undecimated, in the frame of the reference, into full/.
+    merge
+        best: where laser and drone saw the same surface, only the better source goes into the
+        merged cloud (default); all: every point does.
     overwrite
         Replace a result that exists already.
     """
@@ -51,6 +55,7 @@ def command(
             lidar=lidar or (),
             photogrammetry=photogrammetry or (),
             full_resolution=full_resolution,
+            merge=merge,
             overwrite=overwrite,
             work=common.work,
             memory_bytes=common.memory_bytes(),
@@ -62,15 +67,21 @@ def command(
     return execute(common, work, kept="Finished filter steps are kept; run it again to go on.")
 
 
+def _left_out(merged: dict[str, Any]) -> str:
+    count = merged["left_out"]
+    return f" ({_text.count(count)} left out: a better source has them)" if count else ""
+
+
 def _words(document: dict[str, Any], out: Path) -> str:
     parts = []
     for cloud in document["clouds"]:
         parts += [f"{cloud['name']} ({cloud['kind']})", _text.stages(cloud["stages"])]
     parts += [_text.registration(entry) for entry in document["registrations"]]
     merged = document["merged"]
+    spent = f"{document['seconds']['total']:.1f} s"
     parts.append(
-        f"merged {_text.count(merged['points'])} points of {', '.join(merged['clouds'])} "
-        f"in {document['seconds']['total']:.1f} s; report: {out / 'report.html'}"
+        f"merged {_text.count(merged['points'])} points of {', '.join(merged['clouds'])}"
+        f"{_left_out(merged)} in {spent}; report: {out / 'report.html'}"
     )
     full = document["full_resolution"]
     if full is not None:

@@ -29,6 +29,8 @@ from dougong.registration.result import FineResult, Hypothesis, Registration
 from dougong.typing import Points, Transform, Values
 
 Setting = Literal["auto", "off"] | float
+NEGLIGIBLE_PPM = 10.0
+"""1 mm in 100 m, what a good scanner's own scale is known to: such maps count as true to scale."""
 _MAP_SIZE_M = 1e5
 """Coordinates from here on are a map's rather than a scanner's."""
 
@@ -119,6 +121,10 @@ def pair_on_ground(
         return None, (*notes, "map projections are taken to be true to scale (grid_scale = off)")
     given = None if isinstance(setting, str) else float(setting)
     factors = [1.0 if scale is None else given or scale.factor for scale in (one, two)]
+    ppm = 1e6 * (factors[1] / factors[0] - 1.0)
+    if given is None and abs(ppm) < NEGLIGIBLE_PPM:
+        said = f"the map projection scales by {ppm:+.1f} ppm, too little to matter: not applied"
+        return None, (*notes, said)
     if factors[0] == factors[1]:
         return None, tuple(notes)
     pair = Pair(

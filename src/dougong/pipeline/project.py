@@ -9,6 +9,7 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from dougong.errors import InputError
 from dougong.params import Parameters
+from dougong.pipeline.merging import Merge
 from dougong.pipeline.recipes import Recipe
 from dougong.pipeline.settings import suggestion, validated
 from dougong.registration import Register
@@ -57,6 +58,7 @@ class Project(Parameters):
     cloud: Annotated[tuple[Entry, ...], Field(min_length=1)]
     filter: Recipe = Recipe()
     registration: Annotated[Register, Field(alias="register")] = Register()
+    merge: Merge = Merge()
     quality: Quality = Quality()
 
     @field_validator("cloud")

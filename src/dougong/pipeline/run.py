@@ -16,6 +16,7 @@ from dougong.formats import write, write_merged
 from dougong.pipeline.full_resolution import Place, full_notes, write_full_resolution
 from dougong.pipeline.loading import Loader, Mover
 from dougong.pipeline.memory import Room
+from dougong.pipeline.merging import Merge, Part, choose
 from dougong.pipeline.outputs import write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Project
@@ -110,7 +111,7 @@ def run(
         linked = _register_all(movers, reference, project.registration, progress)
     documents = _registration_documents(linked, reference, loader)
     with clock.measure("write"):
-        merged = _write_clouds(linked, reference, out, progress)
+        merged = _write_clouds(linked, reference, project.merge, out, progress)
     for document in documents:
         write_json(out / "registrations" / f"{document['source']}.json", document)
     full = None
@@ -216,12 +217,11 @@ def _registration_documents(
 
 
 def _write_clouds(
-    linked: Sequence[Linked], reference: Mover, out: Path, progress: Progress
+    linked: Sequence[Linked], reference: Mover, merge: Merge, out: Path, progress: Progress
 ) -> dict[str, Any]:
     """Write each filtered cloud and the merged one; return what the merged one holds."""
     frame_of = reference.clouds[0]
-    sure: list[Cloud] = []
-    ids: list[int] = []
+    parts: list[Part] = []
     for source_id, link in enumerate(linked, 1):
         progress.stage(f"writing clouds/{link.mover.name}.laz")
         clouds = link.in_reference(link.mover.clouds, frame_of)
@@ -231,17 +231,34 @@ def _write_clouds(
             placed = link.in_reference(removed, frame_of)
             _write_one(placed, out / REMOVED / f"{link.mover.name}.laz", source_id)
         if link.is_sure:
-            sure += clouds
-            ids += [source_id] * len(clouds)
+            parts += [
+                Part(cloud=c, source_id=source_id, name=link.mover.name, kind=link.mover.kind)
+                for c in clouds
+            ]
     progress.stage(f"writing {MERGED}")
-    write_merged(sure, out / MERGED, source_ids=ids)
-    names = {source_id: link.mover.name for source_id, link in enumerate(linked, 1)}
-    return {
-        "file": MERGED,
-        "points": sum(len(cloud) for cloud in sure),
-        "clouds": [names[source_id] for source_id in dict.fromkeys(ids)],
-        "source_ids": {names[source_id]: source_id for source_id in dict.fromkeys(ids)},
-    }
+    return {"file": MERGED, **_write_merged(parts, merge, out / MERGED, progress)}
+
+
+def _write_merged(
+    parts: Sequence[Part], merge: Merge, path: Path, progress: Progress
+) -> dict[str, Any]:
+    """Write what is chosen of the sure clouds as one; return what it holds and what it does not."""
+    chosen = choose(parts, merge)
+    pairs = zip(parts, chosen.kept, strict=True)
+    write_merged(
+        [part.cloud if kept.all() else part.cloud.select(kept) for part, kept in pairs],
+        path,
+        source_ids=[part.source_id for part in parts],
+    )
+    document = chosen.document(parts)
+    for name, row in document["sources"].items():
+        if row["left_out"]:
+            progress.note(
+                f"merged: {row['left_out']:,} points of {name} are left out where a better source "
+                'saw the same surface (clouds/ holds them; [merge] mode = "all" brings them back)'
+            )
+    ids = {part.name: part.source_id for part in parts}
+    return {**document, "clouds": list(ids), "source_ids": ids}
 
 
 def _write_one(clouds: Sequence[Cloud], path: Path, source_id: int) -> None:

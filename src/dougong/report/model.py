@@ -98,7 +98,7 @@ def from_run(result: Mapping[str, Any], demo: Mapping[str, Any] | None) -> Repor
         links=links,
         notes=tuple(result["notes"]),
         outputs=(
-            ("merged.copc.laz", f"{result['merged']['points']:,} points, source_id per cloud"),
+            ("merged.copc.laz", _merged(result["merged"])),
             ("clouds/", "each filtered cloud in the frame of the reference"),
             ("registrations/", "the transform of each cloud with its proof"),
             ("result.json", "everything on this page for machines"),
@@ -125,6 +125,19 @@ def from_registration(document: Mapping[str, Any]) -> Report:
         inputs=tuple(document["inputs"]),
         parameters=tuple(flat(document["parameters"])),
         provenance=_provenance(document),
+    )
+
+
+def _merged(merged: Mapping[str, Any]) -> str:
+    """Return what the merged cloud holds and what was left out of it, and why."""
+    said = f"{merged['points']:,} points, source_id per cloud"
+    rows = merged.get("sources", {})
+    out = [f"{row['left_out']:,} of {name}" for name, row in rows.items() if row["left_out"]]
+    if not out:
+        return said
+    return (
+        f"{said}; left out where a better source saw the same surface: {' and '.join(out)} (they "
+        'are in clouds/; [merge] mode = "all" brings them back)'
     )
 
 

@@ -1,0 +1,158 @@
+"""The merged cloud: per zone the better source, no hole at the seams, every point counted."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from dougong.cloud import Cloud
+from dougong.pipeline.merging import REASON, Merge, Part, better_first, choose
+from dougong.pipeline.zones import grid_over, zones_of
+
+QUICK = Merge(zone_m=0.5, reach_m=0.05)
+
+
+def wall(rng, length, per_m2, noise, start=0.0, y=0.0):
+    """Points of a wall along x, 3 m high."""
+    count = int(length * 3 * per_m2)
+    return np.column_stack(
+        [rng.uniform(start, start + length, count), rng.normal(y, noise, count),
+         rng.uniform(0, 3, count)]
+    )  # fmt: skip
+
+
+@pytest.fixture
+def seam():
+    """A scanner that saw the first 6 m of a wall, a drone that saw it from 3 m on."""
+    rng = np.random.default_rng(0)
+    return wall(rng, 6, 900, 0.002), wall(rng, 7, 400, 0.012, start=3.0, y=0.006)
+
+
+def slow_covered(points, by, own, other, params):
+    """Point by point, by the words of the module."""
+    grid = other.grid
+    counts = [dict(zip(zones.keys.tolist(), zones.counts.tolist(), strict=True))
+              for zones in (own, other)]  # fmt: skip
+    steps = [int(np.dot(step, grid.strides())) for step in product((-1, 0, 1), repeat=3)]
+    answer = []
+    for p in points:
+        key = int(grid.keys(grid.cells(p[None]))[0])
+        mine, theirs = (sum(count.get(key + step, 0) for step in steps) for count in counts)
+        gap = p - by
+        distance = np.linalg.norm(gap, axis=1)
+        near = int(distance.argmin())
+        if theirs < params.min_density_share * mine or distance[near] > params.reach_m:
+            answer.append(False)
+            continue
+        zone = int(other.find(grid.keys(grid.cells(by[near][None])))[0][0])
+        if np.isnan(other.noise_m[zone]):
+            answer.append(True)
+            continue
+        across = abs(gap[near] @ other.normals[zone])
+        along = np.sqrt(max(distance[near] ** 2 - across**2, 0.0))
+        spacing = params.zone_m / np.sqrt(other.counts[zone])
+        answer.append(bool(along <= max(2.0 * spacing, 0.02)))
+    return np.array(answer)
+
+
+def test_equals_the_slow_reference(seam):
+    scan, drone = seam
+    grid = grid_over([scan, drone], QUICK.zone_m)
+    expected = slow_covered(drone, scan, zones_of(drone, grid), zones_of(scan, grid), QUICK)
+    found = better_first(scan, drone, QUICK)
+    np.testing.assert_array_equal(found.kept_other, ~expected)
+    assert found.kept_one.all()
+    assert 0.3 < expected.mean() < 0.6
+
+
+def test_the_walls_are_the_scanners_and_no_hole_opens_at_the_seam(seam):
+    scan, drone = seam
+    found = better_first(scan, drone, QUICK)
+    inside = (drone[:, 0] > 3.2) & (drone[:, 0] < 5.8)
+    assert found.kept_other[inside].mean() < 0.01
+    assert found.kept_other[drone[:, 0] > 6.1].all()
+    kept = np.vstack([scan, drone[found.kept_other]])
+    places = np.array(list(product(np.arange(0.1, 9.9, 0.05), np.arange(0.1, 2.9, 0.05))))
+    near = np.array([np.abs(kept[:, [0, 2]] - place).max(axis=1).min() for place in places[::3]])
+    whole = np.vstack([scan, drone])
+    before = np.array([np.abs(whole[:, [0, 2]] - place).max(axis=1).min() for place in places[::3]])
+    assert near.max() <= before.max() + 0.03
+
+
+def test_noise_of_zones_is_that_of_the_sensor(seam):
+    for points, noise in zip(seam, (0.002, 0.012), strict=True):
+        zones = zones_of(points, grid_over(list(seam), 0.5))
+        assert zones.typical_noise_m == pytest.approx(noise, rel=0.05)
+        flat = np.isfinite(zones.noise_m)
+        assert np.abs(zones.normals[flat] @ [0.0, 1.0, 0.0]).min() > 0.99
+
+
+def test_a_zone_in_which_the_scanner_is_worse_goes_to_the_drone():
+    rng = np.random.default_rng(1)
+    # The scanner grazes the far part: mixed pixels, 3 cm.
+    scan = np.vstack([wall(rng, 6, 900, 0.002), wall(rng, 3, 900, 0.03, start=7.0)])
+    drone = wall(rng, 10, 900, 0.010)
+    found = better_first(scan, drone, Merge(zone_m=0.5, reach_m=0.1))
+    far = scan[:, 0] > 7.5
+    assert found.kept_one[far].mean() < 0.1
+    assert found.kept_one[scan[:, 0] < 6.0].all()
+    assert found.kept_other[(drone[:, 0] > 7.5) & (drone[:, 0] < 9.5)].all()
+    assert found.kept_other[drone[:, 0] < 5.5].mean() < 0.05
+
+
+def test_a_thin_scan_does_not_push_out_a_dense_drone_cloud():
+    rng = np.random.default_rng(2)
+    found = better_first(wall(rng, 5, 60, 0.002), wall(rng, 5, 900, 0.012), QUICK)
+    assert found.kept_other.all()
+    assert found.kept_one.all()
+
+
+def parts_of(scan, drone):
+    points = np.array_split(scan, 2)
+    clouds = [Cloud.from_points(p + [5e5, 4e6, 30], name=f"scan {k}") for k, p in enumerate(points)]
+    clouds.append(Cloud.from_points(drone + [5e5, 4e6, 30], name="drone"))
+    return [
+        Part(cloud=clouds[0], source_id=1, name="scans", kind="lidar"),
+        Part(cloud=clouds[1], source_id=1, name="scans", kind="lidar"),
+        Part(cloud=clouds[2], source_id=2, name="drone", kind="photogrammetry"),
+    ]
+
+
+def test_the_choice_knows_no_order_of_parts_or_points_and_no_offset(seam):
+    scan, drone = seam
+    parts = parts_of(scan, drone)
+    kept = choose(parts, QUICK).kept
+    np.testing.assert_array_equal(kept[2], better_first(scan, drone, QUICK).kept_other)
+    np.testing.assert_array_equal(choose(parts[::-1], QUICK).kept[0], kept[2])
+    turn = np.random.default_rng(3).permutation(len(drone))
+    mixed = [*parts[:2], replace(parts[2], cloud=parts[2].cloud.select(turn))]
+    np.testing.assert_array_equal(choose(mixed, QUICK).kept[2], kept[2][turn])
+
+
+def test_every_point_is_counted_and_comes_back(seam):
+    parts = parts_of(*seam)
+    books = choose(parts, QUICK).document(parts)
+    assert books["left_out_reason"] == REASON
+    assert books["sources"]["scans"] == {"points": len(seam[0]), "left_out": 0}
+    drone = books["sources"]["drone"]
+    assert drone["points"] + drone["left_out"] == len(seam[1])
+    assert books["left_out"] == drone["left_out"] > 0
+    assert books["noise_m"]["lidar"] < books["noise_m"]["photogrammetry"]
+    every = choose(parts, Merge(mode="all")).document(parts)
+    assert (every["left_out"], every["points"]) == (0, len(seam[0]) + len(seam[1]))
+
+
+def test_one_kind_of_sensor_is_kept_whole(seam):
+    parts = [replace(part, kind="lidar") for part in parts_of(*seam)]
+    chosen = choose(parts, Merge())
+    assert all(kept.all() for kept in chosen.kept)
+    assert "one kind" in chosen.note
+
+
+def test_clouds_without_a_plane_are_kept_whole():
+    rng = np.random.default_rng(4)
+    found = better_first(rng.uniform(0, 9, (500, 3)), rng.uniform(0, 9, (500, 3)), QUICK)
+    assert found.kept_one.all()
+    assert found.kept_other.all()
+    assert "no flat zone" in found.note
