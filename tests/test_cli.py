@@ -18,8 +18,8 @@ from dougong.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = [
-    "demo", "run", "init", "info", "check", "filter", "register", "transform", "report",
-    "view",
+    "demo", "run", "plan", "init", "info", "check", "filter", "register", "transform",
+    "report", "view",
 ]  # fmt: skip
 
 

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from dougong.cloud import Cloud
     from dougong.evaluation.metrics import Truth
     from dougong.evaluation.survey import Scene
+    from dougong.pipeline.memory import Room
     from dougong.pipeline.progress import Progress
+    from dougong.pipeline.project import Project
     from dougong.pipeline.recipes import Recipe
     from dougong.pipeline.steps import Filtered
     from dougong.pipeline.store import Store
@@ -244,38 +246,92 @@ def run_project(
     `merge`, "best" or "all", takes the place of the project's ``merge.mode``.
     """
     from dougong.pipeline.full_resolution import refuse_full_disk
-    from dougong.pipeline.memory import Room, refuse_too_large
+    from dougong.pipeline.memory import Room
     from dougong.pipeline.outputs import refuse_existing, result_folder
-    from dougong.pipeline.project import files_of, from_files, read_project
+    from dougong.pipeline.project import files_of
     from dougong.pipeline.run import run
+
+    out = _named(out)
+    refuse_existing([out / "result.json"], overwrite)
+    asked, folder = _asked_project(project, lidar, photogrammetry, full_resolution, merge)
+    files = [file for entry in asked.cloud for file in files_of(entry, folder)]
+    if asked.project.full_resolution:
+        refuse_full_disk(files, out)
+    _say_if_cold(progress)
+    store, room = _store(out, work), Room.of(memory_bytes)
+    _refuse_or_announce(asked, folder, files, room, store.folder, progress)
+    with result_folder(out) as part:
+        document = run(asked, folder, part, store=store, progress=progress, room=room)
+        _build_report(part, progress)
+    store.finish()
+    return document
+
+
+def _asked_project(
+    project: Path | None,
+    lidar: Sequence[Path],
+    photogrammetry: Sequence[Path],
+    full_resolution: bool,
+    merge: str | None = None,
+) -> tuple[Project, Path]:
+    """Return the project and the folder that its paths are relative to."""
+    from dougong.pipeline.project import from_files, read_project
 
     if project is not None and (lidar or photogrammetry):
         msg = "a project file and --lidar or --photogrammetry were given. Pass one or the other."
         raise InputError(msg)
-    out = _named(out)
-    refuse_existing([out / "result.json"], overwrite)
-    plan = from_files(lidar, photogrammetry) if project is None else read_project(project)
+    asked = from_files(lidar, photogrammetry) if project is None else read_project(project)
     if merge is not None:
-        plan = plan.model_copy(update={"merge": plan.merge.model_copy(update={"mode": merge})})
-    folder = Path() if project is None else project.parent
-    # Laser scans that do not fit are decimated on tiles; a drone's cloud has no such filter.
-    files = {file: entry.kind for entry in plan.cloud for file in files_of(entry, folder)}
-    whole = [file for file, kind in files.items() if kind == "photogrammetry"]
-    refuse_too_large(whole, memory_bytes)
+        asked = asked.model_copy(update={"merge": asked.merge.model_copy(update={"mode": merge})})
     if full_resolution:
-        head = plan.project.model_copy(update={"full_resolution": True})
-        plan = plan.model_copy(update={"project": head})
-    if plan.project.full_resolution:
-        refuse_full_disk(list(files), out)
-    _say_if_cold(progress)
-    store = _store(out, work)
-    with result_folder(out) as part:
-        document = run(
-            plan, folder, part, store=store, progress=progress, room=Room.of(memory_bytes)
-        )
-        _build_report(part, progress)
-    store.finish()
-    return document
+        head = asked.project.model_copy(update={"full_resolution": True})
+        asked = asked.model_copy(update={"project": head})
+    return asked, Path() if project is None else project.parent
+
+
+LONG_SECONDS = 120.0
+"""A run that may take longer is announced with its plan."""
+_QUICK_BYTES = 100_000_000
+
+
+def _refuse_or_announce(
+    project: Project,
+    folder: Path,
+    files: Sequence[Path],
+    room: Room,
+    work: Path,
+    progress: Progress,
+) -> None:
+    """Plan a run whose files are many bytes: refuse what cannot be, say what takes long."""
+    from dougong.pipeline.plan import plan_run, refuse_full_work_disk
+
+    size = sum(file.stat().st_size for file in files if file.is_file())
+    if not room.is_asked and size < _QUICK_BYTES:
+        return  # counting the points of some formats takes a pass over them
+    plan = plan_run(project, folder, room)
+    if plan.refusal is not None:
+        raise InputError(plan.refusal)
+    refuse_full_work_disk(plan, work)
+    if plan.seconds > LONG_SECONDS:
+        progress.note(plan.in_words())
+
+
+def plan(
+    project: Path | None,
+    *,
+    lidar: Sequence[Path],
+    photogrammetry: Sequence[Path],
+    full_resolution: bool,
+    memory_bytes: int | None,
+    progress: Progress,
+) -> Document:
+    """Return what `run_project` would do: ways, memory, disk, time (see `pipeline.plan.Plan`)."""
+    from dougong.pipeline.memory import Room
+    from dougong.pipeline.plan import plan_run
+
+    asked, folder = _asked_project(project, lidar, photogrammetry, full_resolution)
+    progress.stage("counting points")
+    return plan_run(asked, folder, Room.of(memory_bytes)).document()
 
 
 def demo(

@@ -7,7 +7,19 @@ from collections.abc import Sequence
 from cyclopts import App, CycloptsError
 
 import dougong
-from dougong.cli import check, demo, filter, info, init, register, report, run, transform, view
+from dougong.cli import (
+    check,
+    demo,
+    filter,
+    info,
+    init,
+    plan,
+    register,
+    report,
+    run,
+    transform,
+    view,
+)
 from dougong.cli._shell import CANCELLED, fail
 from dougong.errors import InputError
 
@@ -20,7 +32,7 @@ app = App(
     ),
     help_format="plaintext",
 )
-for _command in (demo, run, init, info, check, filter, register, transform, report, view):
+for _command in (demo, run, plan, init, info, check, filter, register, transform, report, view):
     app.command(_command.command, name=_command.__name__.rsplit(".", 1)[1])
 
 

@@ -42,6 +42,12 @@ class Room:
         """Say whether a cloud of `points` fits beside clouds of `waiting` points in all."""
         return estimated_bytes([points, waiting]) <= self.bytes
 
+    def most_tile_points(self, points: int, waiting: int) -> int | None:
+        """Return how many points a tile of a cloud of `points` may have; None: no room for any."""
+        left = self.bytes - tiles_bytes(points, 0, waiting)
+        most = int(min(max(left, 0.0) / _BYTES_PER_TILE_POINT, _MOST_TILE_POINTS))
+        return most if most >= _LEAST_TILE_POINTS else None
+
     def tile_points(self, points: int, waiting: int) -> int:
         """Return how many points a tile of a cloud of `points` may have.
 
@@ -50,17 +56,15 @@ class Room:
         InputError
             There is no room for any tile worth the name.
         """
-        taken = BASE_BYTES + waiting * BYTES_PER_WAITING_POINT + points * _BYTES_PER_BOOKED_POINT
-        left = max(self.bytes - taken, 0.0)
-        most = int(left / _BYTES_PER_TILE_POINT)
-        if most < _LEAST_TILE_POINTS:
-            need = taken + _LEAST_TILE_POINTS * _BYTES_PER_TILE_POINT
+        most = self.most_tile_points(points, waiting)
+        if most is None:
+            need = tiles_bytes(points, _LEAST_TILE_POINTS, waiting)
             msg = (
                 f"{points:,} points need about {need / 1e9:.1f} GB even on tiles, more than "
-                f"{self._name()}. Raise it, or give the clouds one by one."
+                f"{self.name()}. Raise it, or give the clouds one by one."
             )
             raise InputError(msg)
-        return min(most, _MOST_TILE_POINTS)
+        return most
 
     def refuse_kept(self, kept: int, waiting: int, name: str) -> None:
         """Refuse to go on with a decimated cloud that is still too large for what was asked.
@@ -74,14 +78,21 @@ class Room:
             need = estimated_bytes([kept, waiting])
             msg = (
                 f"{name}: {kept:,} points are left after the voxel grid and need about "
-                f"{need / 1e9:.1f} GB, more than {self._name()}. Raise it, or thin the cloud "
+                f"{need / 1e9:.1f} GB, more than {self.name()}. Raise it, or thin the cloud "
                 "more with octree_voxel_grid.voxel_m."
             )
             raise InputError(msg)
 
-    def _name(self) -> str:
+    def name(self) -> str:
+        """Return the room in words, for messages."""
         asked = f"--memory {self.bytes / 1e9:.1f} GB"
         return asked if self.is_asked else f"the {self.bytes / 1e9:.1f} GB that may be used"
+
+
+def tiles_bytes(points: int, tile_points: int, waiting: int = 0) -> int:
+    """Return the memory that a cloud of `points` needs on tiles of at most `tile_points`."""
+    held = waiting * BYTES_PER_WAITING_POINT + points * _BYTES_PER_BOOKED_POINT
+    return BASE_BYTES + held + tile_points * _BYTES_PER_TILE_POINT
 
 
 def _free_bytes() -> float:

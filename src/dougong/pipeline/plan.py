@@ -1,0 +1,215 @@
+"""What a run would do: which clouds are held and which go on tiles, memory, disk, time.
+
+Nothing is decoded but what counting needs. The numbers are upper bounds or rough: how many points
+the voxel grid leaves is known only once it ran.
+"""
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from dougong.errors import OutputError
+from dougong.formats import FileInfo, describe
+from dougong.pipeline.memory import Room, estimated_bytes, tiles_bytes
+from dougong.pipeline.project import Entry, Project, files_of
+from dougong.threads import get_threads
+from dougong.typing import Kind
+
+# CPU seconds per million points, measured on one core (LAZ, a scanned hall of 3e6 points).
+_READ, _TILES, _WRITE = 0.6, 2.0, 1.4
+_FILTER = {"lidar": 4.6, "photogrammetry": 3.9}
+_PAIR_SECONDS = 20.0
+_REPORT_SECONDS = 5.0
+_PARALLEL = 0.8
+"""Share of that work which threads divide."""
+
+_TILE_ROW_BYTES = 32
+_OUT_BYTES_PER_POINT = 12
+"""Of compressed points with colour; every kept point is written twice (its cloud, merged)."""
+
+Way = Literal["in memory", "on tiles", "too large"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedFile:
+    """One input file and how it would be worked on."""
+
+    path: str
+    cloud: str
+    kind: Kind
+    points: int
+    bytes: int
+    stations: int
+    way: Way
+    tile_points: int | None
+    """Most points of a tile; None: no tiles."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What a run would do."""
+
+    files: tuple[PlannedFile, ...]
+    reference: str
+    """Name of the project's cloud whose frame the result is in."""
+    memory_bytes: int
+    """Peak, estimated; where a voxel grid runs on tiles, without what it leaves."""
+    memory_limit_bytes: int | None
+    """What ``--memory`` allows, or four fifths of what is free; None: unknown."""
+    work_bytes: int
+    """Temporary, at most."""
+    out_bytes: int
+    """Of the result, at most: as if the filters took nothing."""
+    seconds: float
+    """Rough, from rates measured on one machine, for the threads in use."""
+    refusal: str | None
+    """Why the run would be refused; None: it would start."""
+
+    def document(self) -> dict[str, Any]:
+        """Return the plan as plain data."""
+        return {**asdict(self), "duration": minutes(self.seconds)}
+
+    def in_words(self) -> str:
+        """Return the plan in one sentence."""
+        tiled = sum(file.way == "on tiles" for file in self.files)
+        return (
+            f"{sum(file.points for file in self.files):,} points in {len(self.files)} files"
+            f"{f', {tiled} of them on tiles' if tiled else ''}: about "
+            f"{self.memory_bytes / 1e9:.1f} GB of memory and {minutes(self.seconds)} "
+            "(rough; `dougong plan` says more)"
+        )
+
+
+def minutes(seconds: float) -> str:
+    """Return a rough duration in words."""
+    if seconds < 90:
+        return f"{max(10, 10 * round(seconds / 10))} s"
+    return f"{round(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def plan_run(
+    project: Project, folder: Path, room: Room, shown: Callable[[Path], str] = str
+) -> Plan:
+    """Return what `run` would do with `project`, whose paths are relative to `folder`.
+
+    Raises
+    ------
+    InputError, FormatError
+        A pattern finds no file, or a file cannot be read.
+    """
+    files: list[PlannedFile] = []
+    row_bytes: dict[str, int] = {}
+    refusals: list[str] = []
+    for entry in project.cloud:
+        for path in files_of(entry, folder):
+            told = describe(path)
+            planned, refusal = _planned(entry, told, room, _held(files), shown(path))
+            files.append(planned)
+            row_bytes[planned.path] = _row_bytes(told)
+            refusals += [refusal] if refusal else []
+    full = project.project.full_resolution
+    return Plan(
+        files=tuple(files),
+        reference=project.reference(),
+        memory_bytes=_peak(files),
+        memory_limit_bytes=None if room.bytes == float("inf") else int(room.bytes),
+        work_bytes=_work_bytes(files, row_bytes),
+        out_bytes=_out_bytes(files, full),
+        seconds=_seconds(files, full),
+        refusal=refusals[0] if refusals else None,
+    )
+
+
+def _held(files: Sequence[PlannedFile]) -> int:
+    """Return the points known to wait in memory behind `files`."""
+    return sum(file.points for file in files if file.way == "in memory")
+
+
+def _planned(
+    entry: Entry, told: FileInfo, room: Room, waiting: int, path: str
+) -> tuple[PlannedFile, str | None]:
+    way: Way = "in memory"
+    tile_points, refusal = None, None
+    if not room.holds(told.points, waiting):
+        way = "on tiles" if entry.kind == "lidar" else "too large"
+        most = room.most_tile_points(told.points, waiting)
+        if way == "on tiles" and most is not None:
+            tile_points = most
+        else:
+            way = "too large"
+            need = estimated_bytes([told.points, waiting])
+            refusal = (
+                f"{path}: {told.points:,} points need about {need / 1e9:.1f} GB, more than "
+                f"{room.name()}. Raise it, or decimate the cloud first."
+            )
+    planned = PlannedFile(
+        path=path,
+        cloud=entry.name,
+        kind=entry.kind,
+        points=told.points,
+        bytes=told.bytes,
+        stations=told.stations,
+        way=way,
+        tile_points=tile_points,
+    )
+    # What only most of the free memory speaks against is tried all the same.
+    return planned, refusal if room.is_asked else None
+
+
+def _row_bytes(told: FileInfo) -> int:
+    """Return about how many bytes one record takes."""
+    return 8 + 4 * len(told.attributes)
+
+
+def _peak(files: Sequence[PlannedFile]) -> int:
+    held = [file.points for file in files if file.way != "on tiles"]
+    tiles = [tiles_bytes(file.points, file.tile_points) for file in files if file.tile_points]
+    return max([estimated_bytes(held), *tiles])
+
+
+def _work_bytes(files: Sequence[PlannedFile], row_bytes: dict[str, int]) -> int:
+    """Return the disk that the largest cloud on tiles takes, and the books of all."""
+    tiles = [
+        2 * file.points * (row_bytes[file.path] + _TILE_ROW_BYTES)
+        for file in files
+        if file.way == "on tiles"
+    ]
+    return max(tiles, default=0) + 2 * sum(file.points for file in files)
+
+
+def _out_bytes(files: Sequence[PlannedFile], full: bool) -> int:
+    copies = sum(file.bytes for file in files) if full else 0
+    return 2 * _OUT_BYTES_PER_POINT * sum(file.points for file in files) + copies
+
+
+def _seconds(files: Sequence[PlannedFile], full: bool) -> float:
+    work = 0.0
+    for file in files:
+        millions = file.points / 1e6
+        each = _READ + _FILTER[file.kind] + 2.0 * _WRITE
+        each += _TILES if file.way == "on tiles" else 0.0
+        each += _READ + _WRITE if full else 0.0
+        work += each * millions
+    work += _PAIR_SECONDS * max(len({file.cloud for file in files}) - 1, 0) + _REPORT_SECONDS
+    return work * (1.0 - _PARALLEL + _PARALLEL / get_threads())
+
+
+def refuse_full_work_disk(plan: Plan, work: Path) -> None:
+    """Refuse a run for which the disk has no room, before it starts.
+
+    Raises
+    ------
+    OutputError
+        The disk of `work` has less free than half of the upper bound: tiles are compressed.
+    """
+    need = plan.work_bytes // 2
+    folder = next(path for path in (work, *work.absolute().parents) if path.is_dir())
+    free = shutil.disk_usage(folder).free
+    if need > free:
+        msg = (
+            f"{folder} has {free / 1e9:.1f} GB free, and the tiles need about {need / 1e9:.1f} GB. "
+            "Free some space or pass another --work."
+        )
+        raise OutputError(msg)
