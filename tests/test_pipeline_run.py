@@ -1,6 +1,7 @@
 """The main job around the registration: who moves, what is merged, exit codes, what is kept."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ import dougong
 from dougong.cli import call
 from dougong.cloud import Cloud
 from dougong.filters.selection import Reason
+from dougong.pipeline.exports import inverse
 from dougong.pipeline.removed import removed_sample
+from dougong.registration import Register
 from dougong.registration.result import Hypothesis, Registration
 
 SHIFT = np.array([3.0, -2.0, 0.5])
@@ -108,6 +111,34 @@ def test_the_option_brings_every_point_back(folder, capsys, monkeypatch):
     assert by_file["merged"]["points"] == every["merged"]["points"]
     page = (folder / "best" / "report.html").read_text()
     assert f"{best['merged']['sources']['map']['left_out']:,} of map" in page
+
+
+def test_the_scanners_frame_can_be_the_reference(folder, capsys, monkeypatch):
+    """The drone cloud comes from its map into ground metres; the way back is written too."""
+    on_map = np.eye(4)
+    on_map[:3, :3] *= 0.9996
+    on_map[:3, 3] = (5e5, 4e6, 30.0)
+    flown = cloud(2)
+    high = flown.frame.to_file(flown.xyz) @ on_map[:3, :3].T + on_map[:3, 3]
+    dougong.write(Cloud.from_points(high, crs="EPSG:32650"), folder / "map.laz")
+    found = replace(answer("ok")(flown, None, Register(filtered=True), source_kind=None,
+                                 target_kind=None), matrix=inverse(on_map))  # fmt: skip
+    monkeypatch.setattr("dougong.pipeline.run.register", lambda *_, **__: found)
+    project = clouds(folder, more='[project]\nreference = "scans"\n[merge]\nmode = "all"\n')
+    code, result = run(capsys, project, "--out", folder / "out")
+    assert (code, result["reference"]) == (0, "scans")
+    merged = dougong.read(folder / "out" / "merged.copc.laz")
+    assert merged.frame.crs is None
+    source = merged.attribute("source_id")
+    for part in (1, 2):
+        extent = np.ptp(merged.xyz[source == part], axis=0)
+        np.testing.assert_allclose(extent, [10.0, 10.0, 3.0], atol=0.05)
+    written = json.loads((folder / "out" / "registrations" / "map.json").read_text())
+    np.testing.assert_allclose(written["matrix_inverse"], on_map, rtol=1e-12, atol=1e-8)
+    names = {path.name for path in (folder / "out" / "registrations").iterdir()}
+    assert names == {
+        "map.json", "map.cloudcompare.txt", "map.pdal.json", "map.metashape.xml"
+    }  # fmt: skip
 
 
 def test_stations_that_are_not_registered_move_by_themselves(folder, capsys, monkeypatch):

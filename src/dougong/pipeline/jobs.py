@@ -22,6 +22,7 @@ from dougong.formats import (
     write,
 )
 from dougong.params import Parameters
+from dougong.pipeline.exports import Ends, write_registration
 from dougong.pipeline.guess import guess_kind
 from dougong.pipeline.marking import GROUND_CLASS, marked, with_classes
 from dougong.pipeline.memory import Room, refuse_too_large
@@ -365,5 +366,12 @@ def register_files(
         "finished_utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "software": software(),
     }
-    write_json(out / "registration.json", document)
+    ends = Ends(
+        source=clouds[0].name,
+        target=clouds[1].name,
+        source_frame=clouds[0].frame,
+        target_frame=clouds[1].frame,
+        files=[str(source.resolve())],
+    )
+    write_registration(out, "registration", document, ends)
     return document

@@ -12,6 +12,7 @@ import numpy as np
 from dougong._checks import as_transform
 from dougong.cloud import Frame
 from dougong.errors import InputError, RegistrationError
+from dougong.pipeline.exports import inverse
 from dougong.registration.document import registration_to_json
 from dougong.registration.result import Registration
 from dougong.typing import Transform
@@ -58,6 +59,7 @@ def to_document(
         result, source=source, target=target, target_frame=target_frame, inputs=inputs
     )
     # What `dougong transform` needs to write the moved cloud as the target's file would be.
+    document["matrix_inverse"] = None if result.matrix is None else inverse(result.matrix)
     document["target_frame"] = {"crs_wkt": target_frame.crs, "unit_m": target_frame.unit_m}
     cleaned: dict[str, Any] = finite(document)
     return cleaned

@@ -13,6 +13,7 @@ import numpy as np
 from dougong.cloud import Cloud
 from dougong.filters.selection import Reason
 from dougong.formats import write, write_merged
+from dougong.pipeline.exports import Ends, write_registration
 from dougong.pipeline.full_resolution import Place, full_notes, write_full_resolution
 from dougong.pipeline.loading import Loader, Mover
 from dougong.pipeline.memory import Room
@@ -112,8 +113,7 @@ def run(
     documents = _registration_documents(linked, reference, loader)
     with clock.measure("write"):
         merged = _write_clouds(linked, reference, project.merge, out, progress)
-    for document in documents:
-        write_json(out / "registrations" / f"{document['source']}.json", document)
+    _write_registrations(documents, linked, reference, out, shown)
     full = None
     if project.project.full_resolution:
         with clock.measure("full_resolution"):
@@ -148,6 +148,27 @@ def run(
     result = finite(result)
     write_json(out / "result.json", result)
     return result
+
+
+def _write_registrations(
+    documents: Sequence[dict[str, Any]],
+    linked: Sequence[Linked],
+    reference: Mover,
+    out: Path,
+    shown: Callable[[Path], str],
+) -> None:
+    """Write each registration and, where it is sure, its forms for other programs."""
+    moved = [link.mover for link in linked if link.result is not None]
+    for document, mover in zip(documents, moved, strict=True):
+        ends = Ends(
+            source=mover.name,
+            target=reference.name,
+            source_frame=mover.clouds[0].frame,
+            target_frame=reference.clouds[0].frame,
+            # One station of a file cannot be named in a pipeline that reads whole files.
+            files=[shown(s.file) for s in mover.sources] if mover.name == mover.entry else (),
+        )
+        write_registration(out / "registrations", mover.name, document, ends)
 
 
 def _places(linked: Sequence[Linked]) -> list[Place]:

@@ -100,7 +100,11 @@ def from_run(result: Mapping[str, Any], demo: Mapping[str, Any] | None) -> Repor
         outputs=(
             ("merged.copc.laz", _merged(result["merged"])),
             ("clouds/", "each filtered cloud in the frame of the reference"),
-            ("registrations/", "the transform of each cloud with its proof"),
+            (
+                "registrations/",
+                "the transform of each cloud, both ways, with its proof; beside it as CloudCompare, "
+                "PDAL and Metashape read it",
+            ),
             ("result.json", "everything on this page for machines"),
         ),
         inputs=tuple(result["inputs"]),
