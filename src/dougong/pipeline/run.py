@@ -165,8 +165,8 @@ def _write_registrations(
             target=reference.name,
             source_frame=mover.clouds[0].frame,
             target_frame=reference.clouds[0].frame,
-            # One station of a file cannot be named in a pipeline that reads whole files.
-            files=[shown(s.file) for s in mover.sources] if mover.name == mover.entry else (),
+            # One scan of a file cannot be named in a pipeline that reads whole files.
+            files=[shown(source.file) for source in mover.sources if not source.is_scan],
         )
         write_registration(out / "registrations", mover.name, document, ends)
 
