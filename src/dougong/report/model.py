@@ -102,8 +102,8 @@ def from_run(result: Mapping[str, Any], demo: Mapping[str, Any] | None) -> Repor
             ("clouds/", "each filtered cloud in the frame of the reference"),
             (
                 "registrations/",
-                "the transform of each cloud, both ways, with its proof; beside it for CloudCompare, "
-                "PDAL and Metashape",
+                "the transform of each cloud, both ways, with its proof; beside it for "
+                "CloudCompare, PDAL and Metashape",
             ),
             ("result.json", "everything on this page for machines"),
         ),
