@@ -211,10 +211,14 @@ class _Edit:
                 value = number_of(child(scan, group, name))
                 if value is not None:
                     put(child(scan, group), name, "Float", words(value * scale))
-        how = "their numbers" if floats is not None else "the step of their integers"
+        how = (
+            "they are floats, so the numbers themselves"
+            if floats is not None
+            else "of their integers only the factor in the header"
+        )
         self.notes.append(
-            f"the registration has a scale of {scale:.9g} and an E57 pose has none: the points "
-            f"were scaled in the scanners' own coordinates ({how})."
+            f"the registration has a scale of {scale:.9g} and an E57 pose has none: the points' "
+            f"own coordinates were scaled ({how})."
         )
 
     def _pictures(

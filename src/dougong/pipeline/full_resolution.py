@@ -146,8 +146,7 @@ def _write(file: Path, output: Path, places: Sequence[Place], target: Frame) -> 
     if all(place.status == "reference" for place in places):
         output = output.with_name(output.name + suffix)
         copy_file(file, output)
-        note = "the reference itself: the file as it was delivered."
-        return Written(path=output, points=0, bytes=output.stat().st_size, notes=(note,))
+        return Written(path=output, points=0, bytes=output.stat().st_size)
     is_e57 = file.suffix.lower() == ".e57"
     matrices: list[Transform | None] = [None] * scans_in(file)[0]
     for place in places:
