@@ -98,6 +98,13 @@ def test_reference_system_travels_in_a_comment(tmp_path):
     assert read(feet).frame.unit_m == pytest.approx((1200 / 3937,) * 3)
 
 
+def test_a_reference_system_with_other_letters_leaves_the_header_ascii(tmp_path):
+    """EPSG words its areas with degree signs; plyfile and others refuse them."""
+    write(Cloud.from_points(np.ones((3, 3)), crs="EPSG:4549"), tmp_path / "a.ply")
+    assert len(plyfile.PlyData.read(tmp_path / "a.ply")["vertex"]) == 3
+    assert 'ID["EPSG",4549]' in read(tmp_path / "a.ply").frame.crs
+
+
 def test_not_finite_rows_are_dropped_and_counted(tmp_path):
     array = vertices()
     array["x"][3], array["y"][4], array["z"][5] = np.nan, np.inf, -np.inf

@@ -363,7 +363,7 @@ def test_merging_refuses_what_does_not_belong_together(tmp_path):
         ("a.ply", b"LASF" + bytes(300), "Rename it to a.las"),
         ("a.csv", b"ASTM-E57" + bytes(300), "Rename it to a.e57"),
         ("a.obj", b"v 1 2 3", r"suffix '\.obj'"),
-        ("a", b"1 2 3", "suffix 'none'"),
+        ("a", b"1 2 3", "has no suffix"),
         ("a.las", b"LASF" + bytes(50), "ends inside its header"),
     ],
 )

@@ -93,6 +93,22 @@ def _turned(records: Records, linear: NDArray[np.float64]) -> Records:
     return records
 
 
+def transformed(xyz: Points, linear: NDArray[np.float64], shift: NDArray[np.float64]) -> Points:
+    """Return linear @ p + shift of each point: every row by itself, whatever rows are beside it.
+
+    By columns: BLAS is slow on products as thin as this, and sums by the number of rows.
+    """
+    x, y, z = (np.ascontiguousarray(xyz[:, axis]) for axis in range(3))
+    moved = np.empty_like(xyz)
+    for axis in range(3):
+        column = x * linear[axis, 0]
+        column += y * linear[axis, 1]
+        column += z * linear[axis, 2]
+        column += shift[axis]
+        moved[:, axis] = column
+    return moved
+
+
 def _step_in(source: Frame, target: Frame, scale: float) -> tuple[float, float, float] | None:
     """Return the source's finest step in target units: a turn mixes the axes."""
     if source.step is None:
@@ -250,7 +266,7 @@ class Cloud:
         shift = (
             linear @ self.frame.origin + np.asarray(target.unit_m) * matrix[:3, 3] - target.origin
         )
-        xyz = self.xyz @ linear.T + shift
+        xyz = transformed(self.xyz, linear, shift)
         step = _step_in(self.frame, target, float(np.cbrt(np.linalg.det(linear))))
         return replace(
             self,

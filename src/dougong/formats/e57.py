@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.cloud import BitField, Records
+from dougong.cloud import BitField, Records, transformed
 from dougong.errors import FormatError
 from dougong.formats.e57_fields import INVALID, NORMAL, FieldSpec, attribute_name, spec_of
 from dougong.formats.e57_pose import Pose, matrix_of, still
@@ -101,13 +101,16 @@ class E57Scan:
                 records[attribute_name(name)] = values
         local = _cartesian(columns)
         pose = self.header.pose
-        if not np.array_equal(pose.rotation, np.eye(3)):
-            local = local @ pose.rotation.T
+        if np.array_equal(pose.rotation, np.eye(3)):
+            local += pose.translation
+        else:
+            local = transformed(local, pose.rotation, pose.translation)
             if set(NORMAL) <= set(records.dtype.names or ()):
-                normals = np.stack([records[axis] for axis in NORMAL], axis=1)
-                for axis, turned in zip(NORMAL, (normals @ pose.rotation.T).T, strict=True):
-                    records[axis] = turned
-        return Block(records, local + pose.translation, is_invalid)
+                normals = np.stack([records[axis] for axis in NORMAL], axis=1, dtype=np.float64)
+                turned = transformed(normals, pose.rotation, np.zeros(3))
+                for k, axis in enumerate(NORMAL):
+                    records[axis] = turned[:, k]
+        return Block(records, local, is_invalid)
 
 
 # pye57 0.4 fills 8-byte integer buffers at the wrong stride, and knows no 4-byte ones: doubles
@@ -123,7 +126,7 @@ def _is_unusable(values: NDArray[Any]) -> Mask:
 
 def _cartesian(columns: dict[str, NDArray[Any]]) -> Points:
     if set(_CARTESIAN) <= set(columns):
-        return np.stack([columns[name].astype(np.float64) for name in _CARTESIAN], axis=1)
+        return np.stack([columns[name] for name in _CARTESIAN], axis=1, dtype=np.float64)
     distance, azimuth, elevation = (columns[name].astype(np.float64) for name in _SPHERICAL)
     level = distance * np.cos(elevation)
     return np.stack(

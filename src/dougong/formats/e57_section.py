@@ -22,8 +22,6 @@ _DATA, _POINTS = 1, 1
 _MOST_PACKET = 65_536
 _PACKETS_AT_ONCE = 64
 
-Progress = Callable[[Mapping[str, NDArray[Any]]], None]
-
 
 class _Plan:
     """How many records go into a packet, and where each field lies in it."""
@@ -60,7 +58,9 @@ class _Plan:
 
 
 def write_section(
-    out: Appender, fields: Mapping[str, tuple[FieldSpec, NDArray[Any]]], seen: Progress
+    out: Appender,
+    fields: Mapping[str, tuple[FieldSpec, NDArray[Any]]],
+    seen: Callable[[Any], None],
 ) -> int:
     """Append the records of a scan; return the physical position of their section.
 
@@ -69,7 +69,7 @@ def write_section(
     fields : mapping
         Field name to its type and values (n,), in the order of the prototype.
     seen : callable
-        Gets each block of stored numbers by field, before it is packed.
+        Gets the bytes of every field, block by block.
     """
     out.align()
     start = out.tell()
@@ -82,9 +82,9 @@ def write_section(
     block = plan.records * _PACKETS_AT_ONCE
     for first in range(0, count, block):
         stop = min(first + block, count)
-        raw = {name: spec.raw(values[first:stop]) for name, (spec, values) in fields.items()}
-        seen(raw)
-        streams = [spec.packed(raw[name]) for name, (spec, _) in fields.items()]
+        streams = [spec.packed(spec.raw(values[first:stop])) for spec, values in fields.values()]
+        for stream in streams:
+            seen(stream)
         _write_packets(out, plan, streams, stop - first)
     out.write(_INDEX_PACKET.pack(0, 0, _INDEX_PACKET.size - 1, 1, 0, 0, out.physical(data)))
     return out.physical(start)

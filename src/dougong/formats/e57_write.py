@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 from xml.dom import minidom
 
-import numpy as np
 from numpy.typing import NDArray
 
 from dougong.formats.atomic import Sink
@@ -208,12 +207,10 @@ class _Writer:
         """Write the records; return a hash of them."""
         digest = hashlib.blake2b(digest_size=16)
 
-        def seen(block: Mapping[str, NDArray[Any]]) -> None:
-            for column in block.values():
-                digest.update(np.ascontiguousarray(column).data)
-
         points = put(scan, "points", "CompressedVector")
-        points.setAttribute("fileOffset", str(write_section(self._out, station.fields, seen)))
+        points.setAttribute(
+            "fileOffset", str(write_section(self._out, station.fields, digest.update))
+        )
         points.setAttribute("recordCount", str(len(station)))
         prototype = put(points, "prototype", "Structure")
         for name, (spec, _) in station.fields.items():

@@ -39,6 +39,7 @@ FINEST_M = 1e-4
 MOVED_M = 1e-3
 """A moved point leaves its file's lattice; its new step is this or finer."""
 _DEGREES = 1e-7
+_MOST_STEPS = 2**31 - 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,12 +132,31 @@ def scaling_for(
     return scale, offset
 
 
+class OutsideLattice(OutputError):
+    """A coordinate is more steps from the offset than 32 bits hold."""
+
+
 def set_integers(
     records: Records, coordinates: Points, scale: NDArray[np.float64], offset: NDArray[np.float64]
 ) -> None:
-    """Fill X, Y, Z of `records` with `coordinates` (n, 3) rounded to the lattice."""
+    """Fill X, Y, Z of `records` with `coordinates` (n, 3) rounded to the lattice.
+
+    Raises
+    ------
+    OutsideLattice
+        One of them does not fit.
+    """
     for axis, name in enumerate("XYZ"):
-        records[name] = np.rint((coordinates[:, axis] - offset[axis]) / scale[axis])
+        steps = (coordinates[:, axis] - offset[axis]) / scale[axis]
+        np.rint(steps, out=steps)
+        if len(steps) and max(-steps.min(), steps.max()) > _MOST_STEPS:
+            msg = (
+                f"a {'xyz'[axis]} of {coordinates[np.abs(steps).argmax(), axis]:.6g} does not fit "
+                f"LAS at a step of {scale[axis]:g} about {offset[axis]:g}. "
+                "Remove far points first (dougong check finds them), or write PLY."
+            )
+            raise OutsideLattice(msg)
+        records[name] = steps
 
 
 def step_for(cloud: Cloud) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ from dougong.formats.atomic import Sink
 from dougong.formats.las_fields import columns_of, coordinate_fields, shrunk_colours
 from dougong.formats.las_header import LasHeader
 from dougong.formats.ply import CRS_COMMENT, PlyHeader, has_crs
+from dougong.formats.units import las_wkt
 
 _NAMES = {
     "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint",
@@ -40,12 +41,20 @@ def ply_parts(cloud: Cloud) -> tuple[bytes, Records, list[str]]:
     if not has_crs(cloud.header, cloud.frame.crs):
         comments = [line for line in comments if not line.lower().startswith("comment crs")]
         if cloud.frame.crs is not None:
-            comments.append(f"comment {CRS_COMMENT}{' '.join(cloud.frame.crs.split())}")
+            comments.append(f"comment {CRS_COMMENT}{_ascii_crs(cloud.frame.crs)}")
     lines = ["ply", f"format {_ENCODINGS[order]} 1.0", *comments, f"element vertex {len(records)}"]
     for name in records.dtype.names or ():
         kind = records.dtype[name]
         lines.append(f"property {_NAMES[kind.str.lstrip('<>|=')]} {name}")
     return "\n".join([*lines, "end_header", ""]).encode(), records, notes
+
+
+def _ascii_crs(crs: str) -> str:
+    """Return a reference system as one line of WKT 1 in ASCII, which is all that PLY allows.
+
+    Letters beyond ASCII stand in names only, and names do not say which system it is.
+    """
+    return " ".join(las_wkt(crs).split()).encode("ascii", "replace").decode("ascii")
 
 
 def _converted(cloud: Cloud, notes: list[str]) -> Records:

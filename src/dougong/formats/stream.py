@@ -118,20 +118,26 @@ class Survey:
 
     def add(self, block: Block) -> Mask:
         """Count a block in and return which of its rows are good."""
-        is_ok: Mask = np.asarray(np.isfinite(block.coordinates).all(axis=1))
-        is_valid = ~block.is_invalid if block.is_invalid is not None else np.ones_like(is_ok)
-        self.rows += len(is_ok)
-        self.invalid += int((~is_valid).sum())
-        self.not_finite += int((~is_ok & is_valid).sum())
-        is_ok &= is_valid
+        is_ok = self.count(block)
         if not is_ok.any():
             return is_ok
         good = block.coordinates if is_ok.all() else block.coordinates[is_ok]
-        self.low = np.minimum(self.low, good.min(axis=0))
-        self.high = np.maximum(self.high, good.max(axis=0))
-        self.decimals = [
-            _decimals(good[:, axis], start) for axis, start in enumerate(self.decimals)
-        ]
+        for axis in range(3):
+            column = np.ascontiguousarray(good[:, axis])
+            self.low[axis] = min(self.low[axis], column.min())
+            self.high[axis] = max(self.high[axis], column.max())
+            self.decimals[axis] = _decimals(column, self.decimals[axis])
+        return is_ok
+
+    def count(self, block: Block) -> Mask:
+        """Count the rows of a block, good and bad, and return which are good."""
+        is_ok: Mask = _finite_rows(block.coordinates)
+        self.rows += len(is_ok)
+        if block.is_invalid is not None and block.is_invalid.any():
+            self.invalid += int(block.is_invalid.sum())
+            self.not_finite += int((~is_ok & ~block.is_invalid).sum())
+            return is_ok & ~block.is_invalid
+        self.not_finite += len(is_ok) - int(is_ok.sum())
         return is_ok
 
     @property
@@ -152,6 +158,15 @@ class Survey:
                 "and were dropped."
             )
         return tuple(found)
+
+
+def _finite_rows(coordinates: Points) -> Mask:
+    """Return which rows (n, 3) are finite; one sum tells where all are."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        if np.isfinite(coordinates.sum()):
+            return np.ones(len(coordinates), dtype=bool)
+    is_finite: Mask = np.asarray(np.isfinite(coordinates).all(axis=1))
+    return is_finite
 
 
 def _is_on_lattice(values: NDArray[np.float64], decimals: int) -> bool:
@@ -262,8 +277,8 @@ def read_scans(scans: list[Scan], rows: int) -> list[Cloud]:
     for scan in scans:
         mine, room = Survey(lacking=_lacking_of(scan)), _Room(scan)
         for block in scan.blocks(rows):
-            is_ok = mine.add(block)
-            whole.add(block)
+            mine.count(block)
+            is_ok = whole.add(block)
             room.add(block, is_ok)
         gathered.append((scan, mine, room))
     _refuse_no_rows(whole, scans[0].path)
@@ -326,7 +341,8 @@ def iterate_scans(scans: list[Scan], rows: int, survey: Survey | None = None) ->
     notes = survey.notes()
     for scan in scans:
         for block in scan.blocks(rows):
-            is_ok = Survey().add(block)
+            is_ok = Survey().count(block)
             if is_ok.any():
-                yield _make(scan, lattice, block.records[is_ok], block.coordinates[is_ok], notes)
+                chosen = slice(None) if is_ok.all() else is_ok
+                yield _make(scan, lattice, block.records[chosen], block.coordinates[chosen], notes)
                 notes = ()
