@@ -49,7 +49,7 @@ def patch_edge_m(points: Points) -> float:
     """
     edge = float(np.max(np.subtract(*extent(points)[::-1]))) / 64.0
     edge = max(edge, 1e-6)
-    sample = points[_in_some_blocks(points, edge)]
+    sample = points[in_some_blocks(points, edge)]
     for _ in range(4):
         _, place, counts = _voxels(sample, edge)
         typical = float(np.median(counts[place]))
@@ -65,7 +65,7 @@ def sensor_noise(points: Points) -> float:
     finer than a voxel. 0.0 where no voxel holds enough points.
     """
     edge = patch_edge_m(points) * 1.5
-    points = points[_in_some_blocks(points, 8.0 * edge)]
+    points = points[in_some_blocks(points, 8.0 * edge)]
     _, place, counts = _voxels(points, edge)
     order = np.argsort(place, kind="stable")
     starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
@@ -95,7 +95,7 @@ def extent(points: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     )
 
 
-def _in_some_blocks(points: Points, edge: float, wanted: int = 200_000) -> Mask:
+def in_some_blocks(points: Points, edge: float, wanted: int = 200_000) -> Mask:
     """Return which points lie in blocks of `edge` chosen by hash; about `wanted` points."""
     every = len(points) // wanted
     if every < 2:
