@@ -131,7 +131,6 @@ def as_cloud(measured: Measured) -> Cloud:
         records=records,
         frame=measured.frame,
         name=f"{measured.source} to {measured.target}",
-        is_moved=True,
     )
 
 
@@ -141,35 +140,32 @@ def write_distances(measured: Measured, path: Path) -> None:
     write(as_cloud(measured), path)
 
 
-def with_distances(clouds: Sequence[Cloud], measured: Measured | None) -> list[Cloud]:
-    """Return clouds of the target's frame with ``m3c2_distance`` and ``m3c2_lod95``, float32.
+def with_distances(cloud: Cloud, measured: Sequence[Measured]) -> Cloud:
+    """Return a cloud of the target's frame with ``m3c2_distance`` and ``m3c2_lod95``, float32.
 
-    A point takes those of the nearest core point; NaN where there is none within 1.5 core
-    spacings, and everywhere for the reference, which is what is measured from.
+    A point takes those of the nearest core point with a distance; NaN where there is none within
+    1.5 core spacings. Points of the reference take those of whichever registered cloud is nearest.
 
     Parameters
     ----------
-    clouds : sequence of Cloud
-    measured : Measured, optional
-        None: NaN everywhere.
+    cloud : Cloud
+    measured : sequence of Measured
+        Whose core points count; none: NaN everywhere.
     """
-    index = None
-    if measured is not None:
-        observed = measured.signed.is_observed
-        index = neighbourhood.build_index(measured.signed.core[observed])
-    result = []
-    for cloud in clouds:
-        distance = np.full(len(cloud), np.nan, dtype=np.float32)
-        lod = distance.copy()
-        if measured is not None and index is not None:
-            at = cloud.rebased(measured.frame.origin).xyz
-            reach = _TAKEN_FROM * measured.signed.scales.core_spacing_m
-            place, _ = neighbourhood.nearest(index, at, reach)
-            found = place >= 0
-            distance[found] = measured.distance_m[observed][place[found]]
-            lod[found] = measured.signed.lod95_m[observed][place[found]]
-        result.append(cloud.with_attribute(DISTANCE, distance).with_attribute(LOD, lod))
-    return result
+    distance = np.full(len(cloud), np.nan, dtype=np.float32)
+    lod = distance.copy()
+    nearest = np.full(len(cloud), np.inf)
+    for one in measured:
+        observed = one.signed.is_observed
+        index = neighbourhood.build_index(one.signed.core[observed])
+        at = cloud.rebased(one.frame.origin).xyz
+        reach = _TAKEN_FROM * one.signed.scales.core_spacing_m
+        place, away = neighbourhood.nearest(index, at, reach)
+        found = (place >= 0) & (away < nearest)
+        nearest[found] = away[found]
+        distance[found] = one.distance_m[observed][place[found]]
+        lod[found] = one.signed.lod95_m[observed][place[found]]
+    return cloud.with_attribute(DISTANCE, distance).with_attribute(LOD, lod)
 
 
 def distances_document(measured: Measured, file: str) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from dougong.formats import (
     write,
 )
 from dougong.params import Parameters
+from dougong.pipeline.distances import distances_document, measure, write_distances
 from dougong.pipeline.exports import Ends, write_registration
 from dougong.pipeline.guess import guess_kind
 from dougong.pipeline.marking import GROUND_CLASS, marked, with_classes
@@ -52,6 +53,8 @@ from dougong.pipeline.tiled import (
 )
 from dougong.registration import Register
 from dougong.typing import Kind
+
+DISTANCES = "distances.laz"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -360,7 +363,14 @@ def register_files(
         target_frame=clouds[1].frame,
         inputs=inputs,
     )
+    measured = None
+    if result.status == "ok" or params.accept_best:
+        progress.stage(f"measuring {source.name} against {target.name}")
+        measured = measure(clouds[0], clouds[1], result)
+    if measured is not None:
+        write_distances(measured, out / DISTANCES)
     document |= {
+        "distances": None if measured is None else distances_document(measured, DISTANCES),
         "kinds": {"source": kinds[0], "target": kinds[1]},
         "peak_memory_bytes": peak_memory_bytes(),
         "finished_utc": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -3,7 +3,7 @@
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,13 @@ import numpy as np
 from dougong.cloud import Cloud
 from dougong.filters.selection import Reason
 from dougong.formats import write, write_merged
+from dougong.pipeline.distances import (
+    Measured,
+    distances_document,
+    measure,
+    with_distances,
+    write_distances,
+)
 from dougong.pipeline.exports import Ends, write_registration
 from dougong.pipeline.full_resolution import Place, full_notes, write_full_resolution
 from dougong.pipeline.loading import Loader, Mover
@@ -31,6 +38,7 @@ from dougong.typing import Transform
 
 MERGED = "merged.copc.laz"
 REMOVED = "removed"
+DISTANCES = "distances"
 _WORST = ("failed", "ambiguous", "ok")
 
 
@@ -42,6 +50,8 @@ class Linked:
     result: Registration | None
     accepts_best: bool = False
     """The user takes the best pose of an ambiguous registration."""
+    measured: Measured | None = None
+    """What its registration leaves between it and the reference; None: not sure, or nothing."""
 
     @property
     def is_sure(self) -> bool:
@@ -82,7 +92,8 @@ def run(
     folder : Path
         What the project's paths are relative to.
     out : Path
-        Gets merged.copc.laz, clouds/, removed/, registrations/, result.json and, if asked, full/.
+        Gets merged.copc.laz, clouds/, removed/, distances/, registrations/, result.json and,
+        if asked, full/.
     store : Store
         Keeps finished filter steps.
     progress : Progress
@@ -110,7 +121,12 @@ def run(
     reference = next(mover for mover in movers if mover.entry == project.reference())
     with clock.measure("register"):
         linked = _register_all(movers, reference, project.registration, progress)
+    with clock.measure("distances"):
+        linked = [_measured(link, reference, progress) for link in linked]
     documents = _registration_documents(linked, reference, loader)
+    for link in linked:
+        if link.measured is not None:
+            write_distances(link.measured, out / DISTANCES / f"{link.mover.name}.laz")
     with clock.measure("write"):
         merged = _write_clouds(linked, reference, project.merge, out, progress)
     _write_registrations(documents, linked, reference, out, shown)
@@ -232,9 +248,25 @@ def _registration_documents(
                 loader.inputs[source.file] for source in (*link.mover.sources, *reference.sources)
             ],
         )
+        | {"distances": _distances_document(link)}
         for link in linked
         if link.result is not None
     ]
+
+
+def _measured(link: Linked, reference: Mover, progress: Progress) -> Linked:
+    """Return a sure link with the distances that its registration leaves."""
+    if link.result is None or not link.is_sure:
+        return link
+    progress.stage(f"measuring {link.mover.name} against {reference.name}")
+    found = measure(link.mover.joined(), reference.joined(), link.result)
+    return replace(link, measured=found)
+
+
+def _distances_document(link: Linked) -> dict[str, Any] | None:
+    if link.measured is None:
+        return None
+    return distances_document(link.measured, f"{DISTANCES}/{link.mover.name}.laz")
 
 
 def _write_clouds(
@@ -243,6 +275,7 @@ def _write_clouds(
     """Write each filtered cloud and the merged one; return what the merged one holds."""
     frame_of = reference.clouds[0]
     parts: list[Part] = []
+    measured = [link.measured for link in linked if link.measured is not None]
     for source_id, link in enumerate(linked, 1):
         progress.stage(f"writing clouds/{link.mover.name}.laz")
         clouds = link.in_reference(link.mover.clouds, frame_of)
@@ -252,6 +285,9 @@ def _write_clouds(
             placed = link.in_reference(removed, frame_of)
             _write_one(placed, out / REMOVED / f"{link.mover.name}.laz", source_id)
         if link.is_sure:
+            if measured:
+                own = measured if link.result is None else [link.measured] if link.measured else []
+                clouds = [with_distances(cloud, own) for cloud in clouds]
             parts += [
                 Part(cloud=c, source_id=source_id, name=link.mover.name, kind=link.mover.kind)
                 for c in clouds
