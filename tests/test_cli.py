@@ -329,6 +329,29 @@ def test_streams_that_take_nothing_are_no_accident(room, redirect, code, said):
     ],
 )
 def test_global_options_may_stand_before_the_command(given, expected):
-    from dougong.cli import command_first
+    from dougong.cli._commands import command_first
 
     assert command_first(given) == expected
+
+
+@pytest.mark.parametrize("flags", [[], ["--json"]])
+def test_ctrl_c_while_the_program_loads_is_heard(flags):
+    """It used to end in a traceback."""
+    code = (
+        "import sys\n"
+        "class Interrupted:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'cyclopts':\n"
+        "            raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Interrupted())\n"
+        f"sys.argv = ['dougong', 'info', 'a.laz', *{flags}]\n"
+        "from dougong.cli import main\n"
+        "main()\n"
+    )
+    result = python("-c", code)
+    assert result.returncode == 130
+    assert "Traceback" not in result.stderr
+    if flags:
+        assert json.loads(result.stdout)["error"]["exit_code"] == 130
+    else:
+        assert result.stderr == "cancelled.\n"

@@ -1,67 +1,20 @@
-"""The ``dougong`` command. A command parses, calls one function of `app`, prints."""
+"""The ``dougong`` command. A command parses, calls one function of `app`, prints.
+
+Nothing is imported here before `main` listens for Ctrl-C.
+"""
 
 import os
 import sys
 from collections.abc import Sequence
 
-from cyclopts import App, CycloptsError
-
-import dougong
-from dougong.cli import (
-    check,
-    demo,
-    filter,
-    info,
-    init,
-    plan,
-    register,
-    report,
-    run,
-    transform,
-    view,
-)
-from dougong.cli._shell import CANCELLED, fail
-from dougong.errors import InputError
-
-app = App(
-    name="dougong",
-    version=dougong.__version__,
-    help=(
-        "Laser scans and drone photogrammetry of a historic building in; one clean, registered, "
-        "proven point cloud out.\n\nStart with: dougong demo"
-    ),
-    help_format="plaintext",
-)
-for _command in (demo, run, plan, init, info, check, filter, register, transform, report, view):
-    app.command(_command.command, name=_command.__name__.rsplit(".", 1)[1])
-
-
-_FLAGS = frozenset({"--quiet", "--json", "--debug"})
-_VALUES = frozenset({"--threads", "--memory", "--engine", "--work", "--seed"})
-
-
-def command_first(tokens: Sequence[str]) -> list[str]:
-    """Return `tokens` with global options that stand before the command moved behind all else."""
-    rest, leading = list(tokens), []
-    while rest and rest[0].split("=")[0] in _FLAGS | _VALUES:
-        takes_next = rest[0] in _VALUES
-        leading += rest[: 1 + takes_next]
-        rest = rest[1 + takes_next :]
-    return rest + leading
+_CANCELLED = 130
 
 
 def call(tokens: Sequence[str]) -> int:
     """Run one command line and return its exit code (0, 1, 2, 3 or 130)."""
-    try:
-        code = app(
-            command_first(tokens),
-            exit_on_error=False,
-            print_error=False,
-            result_action="return_value",
-        )
-    except CycloptsError as error:
-        return fail(InputError(str(error)), as_json="--json" in tokens, debug=False)
-    return int(code or 0)
+    from dougong.cli import _commands
+
+    return _commands.call(tokens)
 
 
 def main() -> None:
@@ -70,11 +23,19 @@ def main() -> None:
         code = call(sys.argv[1:])
     except KeyboardInterrupt:
         # Before a command began, or after it ended: there is nothing to clean up.
-        sys.stderr.write("cancelled.\n")
-        code = CANCELLED
-    if code == CANCELLED:
+        _say_cancelled(as_json="--json" in sys.argv)
+        code = _CANCELLED
+    if code == _CANCELLED:
         # A kernel may still be running on a thread; a normal exit would wait for it.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
+
+
+def _say_cancelled(*, as_json: bool) -> None:
+    if as_json:
+        said = '"type": "Cancelled", "message": "cancelled.", "exit_code": '
+        sys.stdout.write(f'{{"error": {{{said}{_CANCELLED}}}}}\n')
+    else:
+        sys.stderr.write("cancelled.\n")

@@ -1,0 +1,62 @@
+"""Every command by its name, and one command line run."""
+
+from collections.abc import Sequence
+
+from cyclopts import App, CycloptsError
+
+import dougong
+from dougong.cli import (
+    check,
+    demo,
+    filter,
+    info,
+    init,
+    plan,
+    register,
+    report,
+    run,
+    transform,
+    view,
+)
+from dougong.cli._shell import fail
+from dougong.errors import InputError
+
+app = App(
+    name="dougong",
+    version=dougong.__version__,
+    help=(
+        "Laser scans and drone photogrammetry of a historic building in; one clean, registered, "
+        "proven point cloud out.\n\nStart with: dougong demo"
+    ),
+    help_format="plaintext",
+)
+for _command in (demo, run, plan, init, info, check, filter, register, transform, report, view):
+    app.command(_command.command, name=_command.__name__.rsplit(".", 1)[1])
+
+
+_FLAGS = frozenset({"--quiet", "--json", "--debug"})
+_VALUES = frozenset({"--threads", "--memory", "--engine", "--work", "--seed"})
+
+
+def command_first(tokens: Sequence[str]) -> list[str]:
+    """Return `tokens` with global options that stand before the command moved behind all else."""
+    rest, leading = list(tokens), []
+    while rest and rest[0].split("=")[0] in _FLAGS | _VALUES:
+        takes_next = rest[0] in _VALUES
+        leading += rest[: 1 + takes_next]
+        rest = rest[1 + takes_next :]
+    return rest + leading
+
+
+def call(tokens: Sequence[str]) -> int:
+    """Run one command line and return its exit code (0, 1, 2, 3 or 130)."""
+    try:
+        code = app(
+            command_first(tokens),
+            exit_on_error=False,
+            print_error=False,
+            result_action="return_value",
+        )
+    except CycloptsError as error:
+        return fail(InputError(str(error)), as_json="--json" in tokens, debug=False)
+    return int(code or 0)
