@@ -54,3 +54,23 @@ def test_cache_can_be_switched_off_and_an_unwritable_one_is_survived(tmp_path):
     assert not cache.exists()
     cache.write_text("a file where the folder should be")
     assert call(tmp_path, cache) == 4.0
+
+
+def test_a_full_disk_under_the_cache_is_survived(tmp_path):
+    """The compiled kernel is larger than a file may be here; it runs from memory."""
+    kernel_package(tmp_path)
+    code = (
+        "import resource\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
+        "from dougong.kernels.zz_user import user\n"
+        "print(user(1.0))\n"
+    )
+    run = subprocess.run(
+        [sys.executable, "-B", "-c", code],
+        env={"PYTHONPATH": str(tmp_path), "DOUGONG_CACHE_DIR": str(tmp_path / "cache")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (run.returncode, run.stdout) == (0, "4.0\n"), run.stderr[-400:]
+    assert call(tmp_path, tmp_path / "cache") == 4.0

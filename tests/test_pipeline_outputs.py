@@ -147,3 +147,14 @@ def test_a_step_that_cannot_be_kept_is_one_sentence(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match=r"work could not be written: No space left.*--work"):
         store.save("key", step)
     assert list((tmp_path / "work").iterdir()) == []
+
+
+def test_an_error_names_the_folder_that_the_user_named(tmp_path):
+    def job():
+        with outputs.result_folder(tmp_path / "result") as part:
+            raise OutputError(f"The disk is full: {part / 'a.laz'} needs 3 MB.")
+
+    with pytest.raises(OutputError) as caught:
+        job()
+    assert str(tmp_path / "result" / "a.laz") in str(caught.value)
+    assert ".part-" not in str(caught.value)

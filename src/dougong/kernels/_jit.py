@@ -2,8 +2,8 @@
 
 Numba's on-disk cache does not notice an edit in a kernel file that another one imports, so each
 kernel module gets a cache folder named by the hash of its own source and of every kernel module
-it imports. The folder lies in the user's cache directory; where nothing is writable the kernels
-compile in memory (``DOUGONG_NUMBA_CACHE=0`` asks for that).
+it imports. The folder lies in the user's cache directory; where nothing is writable, or the disk is
+full, the kernels compile in memory (``DOUGONG_NUMBA_CACHE=0`` asks for that).
 """
 
 import ast
@@ -12,9 +12,10 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numba
 
@@ -81,7 +82,21 @@ def _compile(func: Callable[P, R], fastmath: bool | set[str]) -> Callable[P, R]:
         )(func)
     finally:
         numba.config.CACHE_DIR = before
+    if folder is not None:
+        _forgive_a_full_disk(compiled)
     return compiled
+
+
+def _forgive_a_full_disk(compiled: Any) -> None:
+    """Let a kernel that cannot be stored (full disk, quota) run all the same, from memory."""
+    store = compiled._cache.save_overload
+
+    def save_overload(signature: Any, data: Any) -> None:
+        # Numba writes beside and renames, and takes an index without its data for a miss.
+        with suppress(OSError):
+            store(signature, data)
+
+    compiled._cache.save_overload = save_overload
 
 
 def kernel(func: Callable[P, R]) -> Callable[P, R]:

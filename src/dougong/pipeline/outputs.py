@@ -60,7 +60,10 @@ def write_text(path: Path, text: str) -> None:
         # The first error is the one to tell, not that of cleaning up after it.
         with suppress(OSError):
             part.unlink()
-        msg = f"{path} could not be written: {error.strerror or error}."
+        msg = (
+            f"{path} could not be written: {error.strerror or error}. "
+            "Free some space, or write elsewhere."
+        )
         raise OutputError(msg) from error
 
 
@@ -144,6 +147,9 @@ def result_folder(out: Path) -> Iterator[Path]:
     try:
         yield part
         _move_into(part, out)
+    except OutputError as error:
+        # The user named `out`; where its files are made first is our own affair.
+        raise OutputError(str(error).replace(str(part), str(out))) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
         _unfinished.discard(part)
