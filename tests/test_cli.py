@@ -355,3 +355,41 @@ def test_ctrl_c_while_the_program_loads_is_heard(flags):
         assert json.loads(result.stdout)["error"]["exit_code"] == 130
     else:
         assert result.stderr == "cancelled.\n"
+
+
+def test_a_folder_that_may_not_be_written_is_refused_before_the_work(room, capsys, monkeypatch):
+    monkeypatch.setattr("dougong.pipeline.jobs.os.access", lambda *_: False)
+    monkeypatch.setattr("dougong.pipeline.jobs.read", None)  # nothing is read
+    tokens = ["filter", str(room), str(room.with_name("o.laz")), "--kind", "lidar", "--quiet"]
+    assert call(tokens) == 1
+    assert "may not be written by this user" in capsys.readouterr().err
+
+
+def test_help_breaks_lines_where_the_terminal_ends_and_nowhere_else():
+    from dougong.cli._commands import unwrapped
+
+    text = """Do a thing.
+
+    A sentence that was
+    broken.
+
+    Parameters
+    ----------
+    mark
+        Keep every point, and the old class in
+        classification_in.
+    other
+        Short.
+    """
+    assert unwrapped(text).splitlines() == [
+        "Do a thing.",
+        "",
+        "A sentence that was broken.",
+        "",
+        "Parameters",
+        "----------",
+        "mark",
+        "    Keep every point, and the old class in classification_in.",
+        "other",
+        "    Short.",
+    ]

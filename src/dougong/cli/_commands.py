@@ -1,5 +1,6 @@
 """Every command by its name, and one command line run."""
 
+import inspect
 from collections.abc import Sequence
 
 from cyclopts import App, CycloptsError
@@ -30,7 +31,26 @@ app = App(
     ),
     help_format="plaintext",
 )
+
+
+def unwrapped(text: str) -> str:
+    """Return a docstring with each paragraph on one line: the terminal's width breaks it anew."""
+    lines: list[str] = []
+    is_parameters = False
+    for line in inspect.cleandoc(text).splitlines():
+        is_parameters = is_parameters or line == "Parameters"
+        before = lines[-1] if lines else ""
+        # Among the parameters only their descriptions, which are indented, are paragraphs.
+        is_text = line.startswith("    ") if is_parameters else True
+        if line and before and is_text and before.startswith("    ") == line.startswith("    "):
+            lines[-1] = f"{before} {line.strip()}"
+        else:
+            lines.append(line)
+    return "\n".join(lines)
+
+
 for _command in (demo, run, plan, init, info, check, filter, register, transform, report, view):
+    _command.command.__doc__ = unwrapped(_command.command.__doc__ or "")
     app.command(_command.command, name=_command.__name__.rsplit(".", 1)[1])
 
 

@@ -1,5 +1,6 @@
 """The jobs on single files: filter one, move one, register one onto another."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -7,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dougong.cloud import Cloud, Frame
-from dougong.errors import InputError
+from dougong.errors import InputError, OutputError
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
 from dougong.filters.selection import Reason
 from dougong.formats import (
@@ -124,6 +125,8 @@ def refuse_output(input: Path, output: Path, files: Sequence[Path], overwrite: b
     InputError
         It is the input, one of `files` exists already, the folder is missing, or the suffix is
         not one that is written.
+    OutputError
+        The folder may not be written.
     """
     if output.exists() and input.exists() and output.samefile(input):
         msg = f"{output} is the input itself; inputs are never overwritten. Name another output."
@@ -138,6 +141,9 @@ def refuse_output(input: Path, output: Path, files: Sequence[Path], overwrite: b
     if not output.parent.is_dir():
         msg = f"{output.parent} is not a folder, so {output.name} cannot be written. Make it first."
         raise InputError(msg)
+    if not os.access(output.parent, os.W_OK):
+        msg = f"{output.parent} may not be written by this user. Change its permissions."
+        raise OutputError(msg)
 
 
 def filter_file(

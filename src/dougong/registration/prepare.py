@@ -136,8 +136,8 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
 def _check_count(count: int, name: str) -> None:
     if count < MIN_POINTS:
         msg = (
-            f"{name} has {count} usable points, at least {MIN_POINTS} are needed to look for a "
-            "pose. Check that the right file was given (`dougong info`)."
+            f"{name} has too few usable points ({count}); at least {MIN_POINTS} are needed to look "
+            "for a pose. Check that the right file was given (`dougong info`)."
         )
         raise RegistrationError(msg)
 

@@ -105,8 +105,9 @@ def propose_scale(source: Cloud, target: Cloud) -> ScaleProposal | None:
     if abs(np.log(height / unit)) > np.log(3.0):
         return None
     larger = "target" if ratio > 1.0 else "source"
+    shown = float(f"{size:.3g}")
     sentence = (
-        f"the {larger} is about {size:.3g} times as large as the other cloud, as if it were in "
+        f"the {larger} is about {shown:,g} times as large as the other cloud, as if it were in "
         f"{UNIT_RATIOS[unit]}; expected the same unit. Scale it by 1/{unit:g} (or fix its "
         "units) and register again."
     )
