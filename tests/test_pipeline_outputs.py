@@ -145,7 +145,7 @@ def test_a_step_that_cannot_be_kept_is_one_sentence(tmp_path, monkeypatch):
     step = Filtered(cloud=cloud, codes=codes, ground_class=codes, stages=())
     store = Store(tmp_path / "work", is_temporary=True)
     with pytest.raises(OutputError, match=r"work could not be written: No space left.*--work"):
-        store.save("key", step)
+        store.save("key", step, ())
     assert list((tmp_path / "work").iterdir()) == []
 
 
