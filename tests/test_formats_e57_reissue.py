@@ -1,14 +1,19 @@
 """E57 issued again with new poses: read back by libe57 and pye57, nothing ignored."""
 
 import resource
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from pye57 import libe57
 
 from dougong.errors import FormatError, InputError, OutputError
-from dougong.formats import is_same_crs
+from dougong.formats import is_same_crs, read, write
+from dougong.formats.e57_container import Appender, Pages
+from dougong.formats.e57_fields import FieldSpec
 from dougong.formats.e57_pose import motion_of, quaternion_of
 from dougong.formats.e57_reissue import reissue_e57
+from dougong.formats.e57_section import write_section
 from e57_surveys import POSES, survey, turn
 from reference.e57 import differing, pose, rotation_of, tree, world
 
@@ -160,6 +165,69 @@ def test_scans_that_are_not_sure_are_left_out_with_their_pictures(tmp_path):
             after[f"/images2D/{new}/pinholeRepresentation/jpegImage"][1]
             == (before[f"/images2D/{old}/pinholeRepresentation/jpegImage"][1])
         )
+
+
+@pytest.mark.parametrize("kind", ["scaled", "double"])
+def test_what_is_left_out_leaves_no_bytes(tmp_path, kind):
+    """Also of files that we wrote, whose index packets hold positions; and with a scale."""
+    write(read(survey(tmp_path / "a.e57", kind=kind, rows=120)), tmp_path / "b.e57")
+    for source in (tmp_path / "a.e57", tmp_path / "b.e57"):
+        motions = [None, None, motion(0.2, 0.5), None]
+        reissue_e57(source, tmp_path / "c.e57", motions, crs=None, overwrite=True)
+        before, after = tree(source), tree(tmp_path / "c.e57")
+        sizes = [path.stat().st_size for path in (tmp_path / "c.e57", source)]
+        assert sizes[0] < 0.3 * sizes[1]
+        there, is_invalid = world(before, 2)
+        found, _ = world(after, 0)
+        expected = there @ motion(0.2, 0.5)[:3, :3].T + motion(0.2, 0.5)[:3, 3]
+        assert np.abs(found - expected)[~is_invalid].max() < 1e-8
+        assert np.array_equal(
+            after["/data3D/0/points/acme:temperature"], before["/data3D/2/points/acme:temperature"]
+        )
+        again = reissue_e57(
+            tmp_path / "c.e57", tmp_path / "d.e57", [np.eye(4)], crs=None, overwrite=True
+        )
+        assert again.points == after["/data3D/0/points"][1]
+
+
+def test_xml_before_the_points(tmp_path):
+    """Where the XML lies is up to the writer: new XML then goes to the end."""
+    spec = FieldSpec(kind="integer", low=0, high=1000)
+    values = np.arange(500)
+    fields = {f"cartesian{axis}": (spec, values) for axis in "XYZ"}
+    prototype = "".join(f'<{n} type="Integer" minimum="0" maximum="1000"/>' for n in fields)
+
+    def xml(place):
+        return (
+            (
+                f'<e57Root type="Structure" xmlns="{libe57.E57_V1_0_URI}">'
+                '<formatName type="String">ASTM E57 3D Imaging Data File</formatName>'
+                '<guid type="String">{1}</guid><versionMajor type="Integer">1</versionMajor>'
+                '<versionMinor type="Integer">0</versionMinor>'
+                '<data3D type="Vector" allowHeterogeneousChildren="1"><vectorChild type="Structure">'
+                f'<points type="CompressedVector" fileOffset="{place}" recordCount="500">'
+                f'<prototype type="Structure">{prototype}</prototype>'
+                '<codecs type="Vector" allowHeterogeneousChildren="1"/></points></vectorChild></data3D>'
+                "</e57Root>"
+            )
+            .encode()
+            .ljust(2000)
+        )
+
+    with (tmp_path / "a.e57").open("w+b") as file:
+        out = Appender(file)
+        out.write(xml(0))
+        place = write_section(out, fields, lambda _: None)
+        layout = replace(out.finish(b" "), xml_start=48, xml_bytes=2000)
+        pages = Pages(file, layout, "a.e57")
+        pages.write(48, xml(place))
+        pages.write(0, layout.packed())
+    assert len(read(tmp_path / "a.e57")) == 500
+    reissue_e57(tmp_path / "a.e57", tmp_path / "b.e57", [motion()], crs=None)
+    before, after = tree(tmp_path / "a.e57"), tree(tmp_path / "b.e57")
+    assert all(is_of_the_frame(path) for path in differing(before, after))
+    expected = world(before, 0)[0] @ motion()[:3, :3].T + motion()[:3, 3]
+    assert np.abs(world(after, 0)[0] - expected).max() < 1e-8
 
 
 def test_the_same_input_gives_the_same_bytes(tmp_path):

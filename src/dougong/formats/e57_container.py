@@ -206,8 +206,8 @@ class Appender:
         """Fill up to a multiple of four, where sections begin."""
         self.write(bytes(-self.tell() % 4))
 
-    def finish(self, xml: bytes) -> None:
-        """Append the XML and put the header in its place."""
+    def finish(self, xml: bytes) -> Layout:
+        """Append the XML, put the header in its place, and return it."""
         self.align()
         start = self.tell()
         self.write(xml)
@@ -216,6 +216,7 @@ class Appender:
         size = self._written // self._payload * self.page
         layout = Layout((1, 0), self.page, size, start, len(xml))
         Pages(self._sink, layout, "the new file").write(0, layout.packed())
+        return layout
 
     def _flush(self, count: int) -> None:
         joined = np.concatenate(self._waiting) if len(self._waiting) > 1 else self._waiting[0]

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from dougong.errors import InputError
 from dougong.formats.atomic import Sink, refuse_bad_target, replacing
-from dougong.formats.e57_container import Layout, Pages, read_layout
+from dougong.formats.e57_container import Appender, Layout, Pages, read_layout
 from dougong.formats.e57_fields import LENGTHS
 from dougong.formats.e57_floats import FloatFields, scale_floats
 from dougong.formats.e57_pose import Motion, motion_of
+from dougong.formats.e57_relocate import copy_section
 from dougong.formats.e57_xml import (
     Node,
     attribute,
@@ -85,11 +86,11 @@ def reissue_e57(
         document = parse(pages.read(layout.xml_start, layout.xml_bytes), source.name)
         edit = _Edit(document.documentElement, motions, source.name)
         edit.run(crs)
-        xml = document.toxml(encoding="utf-8") + b"\n"
-        end = _points_end(document.documentElement, layout)
         with replacing(output, expected_bytes=layout.file_bytes) as sink:
-            pages.copy_into(sink, end)
-            _finish(sink, layout, end, xml, edit.floats, output.name)
+            if edit.is_whole:
+                _copy_all(pages, sink, document, edit.floats, output.name)
+            else:
+                _copy_some(pages, sink, document, edit.floats, output.name)
     return Written(
         path=output,
         points=edit.points,
@@ -115,30 +116,49 @@ def scans_in(path: Path) -> tuple[int, str | None]:
     return len(list(children(child(root, "data3D")))), as_wkt(text) if text else None
 
 
+def _copy_all(
+    pages: Pages, sink: Sink, document: Node, floats: Sequence[FloatFields], name: str
+) -> None:
+    """Copy a file page by page, and put the new XML behind its points and pictures."""
+    layout = pages.layout
+    start = _points_end(document.documentElement, layout)
+    pages.copy_into(sink, start)
+    xml = document.toxml(encoding="utf-8")
+    payload = layout.payload
+    whole = -(-(start + len(xml)) // payload)
+    layout = replace(layout, file_bytes=whole * layout.page, xml_start=start, xml_bytes=len(xml))
+    new = Pages(sink, layout, name)
+    new.write(start, xml + bytes(whole * payload - start - len(xml)))
+    for fields in floats:
+        scale_floats(new, fields)
+    new.write(0, layout.packed())
+
+
 def _points_end(root: Node, layout: Layout) -> int:
     """Return the logical position behind all that must be kept: the old XML goes if it is last."""
-    places = [
-        int(node.getAttribute("fileOffset"))
-        for node in root.getElementsByTagName("*")
-        if node.getAttribute("fileOffset")
-    ]
+    places = [int(node.getAttribute("fileOffset")) for node in _with_bytes(root)]
     is_last = all(layout.logical(place) < layout.xml_start for place in places)
     return layout.xml_start if is_last else layout.logical(layout.file_bytes)
 
 
-def _finish(
-    sink: Sink, layout: Layout, start: int, xml: bytes, floats: Sequence[FloatFields], name: str
+def _copy_some(
+    pages: Pages, sink: Sink, document: Node, floats: Sequence[FloatFields], name: str
 ) -> None:
-    """Put new XML behind the copied pages, scale what is to be scaled, and set the header."""
-    payload = layout.payload
-    whole = -(-(start + len(xml)) // payload)
-    padding = bytes(whole * payload - start - len(xml))
-    layout = replace(layout, file_bytes=whole * layout.page, xml_start=start, xml_bytes=len(xml))
-    pages = Pages(sink, layout, name)
-    pages.write(start, xml + padding)
+    """Copy only the points and pictures that the new XML names."""
+    out = Appender(sink)
+    moved: dict[int, int] = {}
+    for node in _with_bytes(document.documentElement):
+        place = int(node.getAttribute("fileOffset"))
+        moved[place] = copy_section(pages, place, out)
+        node.setAttribute("fileOffset", str(moved[place]))
+    new = Pages(sink, out.finish(document.toxml(encoding="utf-8")), name)
     for fields in floats:
-        scale_floats(pages, fields)
-    pages.write(0, layout.packed())
+        scale_floats(new, replace(fields, place=moved[fields.place]))
+
+
+def _with_bytes(root: Node) -> list[Node]:
+    """Return the elements whose bytes lie outside the XML: tables of points, pictures."""
+    return [node for node in root.getElementsByTagName("*") if node.getAttribute("fileOffset")]
 
 
 class _Edit:
@@ -154,6 +174,8 @@ class _Edit:
         if all(matrix is None for matrix in motions):
             raise InputError(f"{name}: every scan is left out, so there is nothing to write.")
         self._matrices = list(motions)
+        self.is_whole = True
+        """Nothing is left out."""
         self.notes: list[str] = []
         self.floats: list[FloatFields] = []
         self.stations: list[PlacedStation] = []
@@ -169,6 +191,7 @@ class _Edit:
             by_guid[text_of(child(scan, "guid")).strip()] = motion
             if motion is None:
                 scan.parentNode.removeChild(scan)
+                self.is_whole = False
         self._pictures(by_guid, motions)
         set_crs(self._root, crs, text_of(child(self._root, "coordinateMetadata")))
         self._new_guid()
@@ -240,6 +263,7 @@ class _Edit:
                 set_pose(image, motion.applied(pose_of(image)))
             elif motion is None and (has_pose or guid in by_guid):
                 images.removeChild(image)
+                self.is_whole = False
                 lost += 1
         if lost:
             self.notes.append(

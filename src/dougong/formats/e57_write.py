@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from dougong.formats.atomic import Sink
 from dougong.formats.e57_container import Appender, Pages, read_layout
 from dougong.formats.e57_fields import NORMALS_URI, OURS, OURS_URI, FieldSpec
+from dougong.formats.e57_relocate import copy_section
 from dougong.formats.e57_section import write_section
 from dougong.formats.e57_stations import Station
 from dougong.formats.e57_xml import (
@@ -40,8 +41,6 @@ from dougong.formats.e57_xml import (
 from dougong.formats.stream import opened
 
 E57_URI = "http://www.astm.org/COMMIT/E57/2010-e57-v1.0"
-_BLOB_HEAD = 16
-_COPY_BYTES = 8 << 20
 _OF_THE_FILE = {
     "data3D", "images2D", "guid", "coordinateMetadata", "formatName", "versionMajor",
     "versionMinor", "e57LibraryVersion",
@@ -166,20 +165,11 @@ class _Writer:
         if node.getAttribute("type") == "CompressedVector":
             node.parentNode.removeChild(node)
         elif node.getAttribute("type") == "Blob":
-            node.setAttribute("fileOffset", str(self._copied_blob(old.pages, node)))
+            place = copy_section(old.pages, int(node.getAttribute("fileOffset")), self._out)
+            node.setAttribute("fileOffset", str(place))
         else:
             for below in list(children(node)):
                 self._bring_blobs(old, below)
-
-    def _copied_blob(self, pages: Pages, node: Node) -> int:
-        """Append the section of a blob; return its physical position."""
-        start = pages.layout.logical(int(node.getAttribute("fileOffset")))
-        stop = start + int.from_bytes(pages.read(start, _BLOB_HEAD)[8:], "little")
-        self._out.align()
-        place = self._out.physical(self._out.tell())
-        for at in range(start, stop, _COPY_BYTES):
-            self._out.write(pages.read(at, min(_COPY_BYTES, stop - at)))
-        return place
 
     def _scan(self, scans: Node, station: Station) -> str:
         """Add one scan with its points; return its new id."""
