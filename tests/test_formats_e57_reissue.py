@@ -204,10 +204,12 @@ def test_xml_before_the_points(tmp_path):
                 '<formatName type="String">ASTM E57 3D Imaging Data File</formatName>'
                 '<guid type="String">{1}</guid><versionMajor type="Integer">1</versionMajor>'
                 '<versionMinor type="Integer">0</versionMinor>'
-                '<data3D type="Vector" allowHeterogeneousChildren="1"><vectorChild type="Structure">'
+                '<data3D type="Vector" allowHeterogeneousChildren="1">'
+                '<vectorChild type="Structure">'
                 f'<points type="CompressedVector" fileOffset="{place}" recordCount="500">'
                 f'<prototype type="Structure">{prototype}</prototype>'
-                '<codecs type="Vector" allowHeterogeneousChildren="1"/></points></vectorChild></data3D>'
+                '<codecs type="Vector" allowHeterogeneousChildren="1"/>'
+                "</points></vectorChild></data3D>"
                 "</e57Root>"
             )
             .encode()
