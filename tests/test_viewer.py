@@ -18,7 +18,10 @@ import dougong.report.render as rendering
 from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.formats import write
-from dougong.report.layers import BLUE, COLOURS, Layer
+from dougong.pipeline.pairs import read_pairs
+from dougong.report.figures import find_place
+from dougong.report.layers import BLUE, COLOURS, Layer, Removed
+from dougong.report.looks import look_at
 from dougong.report.model import from_run
 from dougong.report.payload import (
     NO_CLOUD,
@@ -33,9 +36,10 @@ from dougong.report.payload import (
     sizes,
     thinned,
 )  # fmt: skip
+from dougong.report.picking import picking
 from dougong.report.server import Served, ViewServer, byte_range
-from dougong.report.streaming import items_of
-from dougong.report.viewer import why_missing
+from dougong.report.streaming import items_of, prepare
+from dougong.report.viewer import view_3d, why_missing
 from test_report import building, registration, run_result
 
 BEACONS = np.array([[3.0, -7.0, 7.0], [3.0, -4.0, 11.0]])
@@ -86,16 +90,20 @@ def test_packed_points_are_off_by_half_a_step_at_most(spread_m):
                   is_sure=True, colours=rng.integers(0, 255, (3000, 3)).astype(np.uint8),
                   classes=(np.arange(3000) % 7).astype(np.uint8))  # fmt: skip
     chosen = np.arange(0, 3000, 2)
-    found = rng.uniform(0, REACH_M, len(chosen))
-    packed = pack(layer, chosen, found, 0)
+    found = rng.uniform(-REACH_M, REACH_M, len(chosen))
+    reasons = (np.arange(len(chosen)) % 8).astype(np.uint8)
+    packed = pack(points[chosen], source=0, element="e", colours=layer.colours[chosen],
+                  found=found, classes=layer.classes[chosen], reasons=reasons)  # fmt: skip
     xyz, planes = unpacked(packed)
     order = np.lexsort(xyz.T)
     wanted = np.lexsort((np.round(points[chosen] / STEP_M) * STEP_M).T)
     assert np.abs(xyz[order] - points[chosen][wanted]).max() <= STEP_M / 2 + 1e-9
     assert (layer.colours[chosen][wanted] == planes[1:4, order].T).all()
-    decoded = REACH_M * (planes[4, order] / 254) ** 2
-    assert np.abs(decoded - found[wanted]).max() < 2 * REACH_M / 254
+    root = (planes[4, order] - 127) / 127
+    decoded = REACH_M * np.sign(root) * root**2
+    assert np.abs(decoded - found[wanted]).max() < 2 * REACH_M / 127
     assert (planes[5, order] == layer.classes[chosen][wanted]).all()
+    assert (planes[6, order] == reasons[wanted]).all()
 
 
 def test_thinning_is_even_and_keeps_small_clouds_whole():
@@ -242,3 +250,126 @@ def test_the_command_serves_until_ctrl_c_and_cleans_up(tmp_path):
         process.stdout.close()
     assert code == 0
     assert list(scratch.iterdir()) == []
+
+
+POST = {"Content-Type": "application/json"}
+PICKED = [
+    {"name": f"p{n}", "source": [1.5 * n, 2.25, 3.0], "target": [5e5 + n, 4e6 + 0.1234, -7.5]}
+    for n in range(1, 4)
+]
+
+
+@pytest.fixture
+def taking(tmp_path):
+    told, takes = picking(tmp_path / "scan.laz", tmp_path / "my drone.laz", tmp_path / "pairs.csv")
+    opened = ViewServer({"": Served(kind="text/html", body=b"page")}, takes=takes)
+    yield opened, told, tmp_path / "pairs.csv"
+    opened.close()
+
+
+def sent(server, body, path="pairs", **headers):
+    address = urlsplit(server.url)
+    link = http.client.HTTPConnection(address.hostname, address.port, timeout=5)
+    own = {"Host": address.netloc, "Origin": f"http://{address.netloc}"} | POST
+    link.request("POST", address.path + path, body=body, headers=own | headers)
+    answer = link.getresponse()
+    found = answer.status, answer.read()
+    link.close()
+    return found
+
+
+def test_the_page_saves_its_pairs_in_the_named_file(taking):
+    server, told, file = taking
+    status, body = sent(server, json.dumps({"pairs": PICKED}))
+    assert status == 200
+    assert json.loads(body) == {"pairs": 3, "path": str(file)}
+    assert file.read_text().splitlines()[0] == told["header"]
+    back = read_pairs(file, "scan")
+    assert back.names == ("p1", "p2", "p3")
+    assert back.target.tolist() == [pair["target"] for pair in PICKED]
+    assert "'" in told["command"], "a name with a blank is quoted"
+    again, _ = picking(file.parent / "scan.laz", file.parent / "drone.laz", file)
+    assert again["list"] == PICKED
+    assert sent(server, json.dumps({"pairs": PICKED[:1]}))[0] == 200
+    assert len(file.read_text().splitlines()) == 2, "the file is replaced"
+
+
+@pytest.mark.parametrize(
+    ("headers", "path", "status"),
+    [
+        ({"Origin": "http://evil.example"}, "pairs", 403),
+        ({"Origin": ""}, "pairs", 403),
+        ({"Host": "evil.example", "Origin": "http://evil.example"}, "pairs", 403),
+        ({"Content-Type": "text/plain"}, "pairs", 415),
+        ({"Content-Length": "99999999"}, "pairs", 413),
+        ({}, "../pairs", 404),
+        ({}, "cloud/0", 404),
+    ],
+)
+def test_no_other_page_can_write(taking, headers, path, status):
+    server, _, file = taking
+    assert sent(server, json.dumps({"pairs": PICKED}), path, **headers)[0] == status
+    assert not file.exists()
+
+
+@pytest.mark.parametrize(
+    "body",
+    ["", "[]", "{", '{"pairs": [{"name": "a"}]}', '{"pairs": [], "path": "/etc/passwd"}',
+     '{"pairs": [{"name": "a", "source": [1, 2, NaN], "target": [1, 2, 3]}]}'],
+)  # fmt: skip
+def test_what_are_no_pairs_is_refused_in_words(taking, body):
+    server, _, file = taking
+    status, said = sent(server, body)
+    assert status == 400
+    assert len(json.loads(said)["error"]) > 10
+    assert not file.exists()
+
+
+@pytest.mark.skipif(why_missing() is not None, reason=f"no viewer: {why_missing()}")
+def test_pairs_are_picked_in_two_clouds(tmp_path):
+    for name in ("a", "b", "c"):
+        write(Cloud.from_points(building(0)), tmp_path / f"{name}.copc.laz")
+    clouds = [tmp_path / f"{name}.copc.laz" for name in "abc"]
+    with pytest.raises(InputError, match=r"--pairs needs two clouds.* got 3"):
+        prepare(clouds, tmp_path, print, tmp_path / "p.csv")
+    with pytest.raises(InputError, match="is no folder"):
+        prepare(clouds[:2], tmp_path, print, tmp_path / "none" / "p.csv")
+    (tmp_path / "notes.csv").write_text("my notes\n")
+    with pytest.raises(InputError, match="no column source_x"):
+        prepare(clouds[:2], tmp_path, print, tmp_path / "notes.csv")
+    assert (tmp_path / "notes.csv").read_text() == "my notes\n"
+    scene = prepare(clouds[:2], tmp_path, print, tmp_path / "p.csv")
+    assert list(scene.takes) == ["pairs"]
+    assert prepare(clouds, tmp_path, print).takes == {}
+
+
+def test_attributes_of_a_file_become_colourings(tmp_path):
+    points = building(0)
+    distance = np.full(len(points), np.nan, np.float32)
+    distance[::2] = 0.03 * np.sign(points[::2, 0])
+    cloud = Cloud.from_points(
+        points, m3c2_distance=distance, dougong_reason=np.full(len(points), 4, np.uint8)
+    )
+    write(cloud, tmp_path / "a.copc.laz")
+    look = look_at(tmp_path / "a.copc.laz")
+    assert look.residual == "m3c2_distance"
+    assert look.residual_shown_m == pytest.approx(0.05)
+    assert look.reasons == {4}
+    assert {"reason", "residual"} <= look.colours
+    write(Cloud.from_points(points), tmp_path / "b.copc.laz")
+    assert not look_at(tmp_path / "b.copc.laz").colours & {"reason", "residual"}
+
+
+@pytest.mark.skipif(why_missing() is not None, reason=f"no viewer: {why_missing()}")
+def test_removed_points_ride_with_their_cloud(layers):
+    out = Removed(after=BEACONS, reasons=np.array([2, 4], np.uint8))
+    shown = [replace(layers[0], removed=out), layers[1]]
+    view = view_3d(shown, find_place(shown))
+    assert view.scene["reasons"] == [0, 2, 4]
+    assert view.scene["colours"][-1] == "reason"
+    packed = view.clouds[1]
+    assert packed.head["source"] == 0
+    assert packed.head["has_reason"]
+    assert np.abs(np.sort(unpacked(packed)[0], 0) - np.sort(BEACONS, 0)).max() <= STEP_M / 2 + 1e-9
+    assert "2 points that the filters took out" in view.lead
+    assert "reason" not in view_3d(layers, find_place(layers)).scene["colours"]

@@ -1,111 +1,36 @@
-"""The 3-D view in a real browser: what it draws, what its controls change, what it asks for.
+"""The 3-D view in a real browser: what it draws, what its controls change, what it asks for."""
 
-Needs Playwright (the extra `browser`) and a Chromium of the system (or DOUGONG_CHROMIUM).
-"""
+from dataclasses import replace
 
-import os
-import shutil
-
-import cv2
 import numpy as np
 import pytest
 
 from dougong.cloud import Cloud
 from dougong.formats import write
+from dougong.report.layers import Removed
 from dougong.report.model import from_run
 from dougong.report.render import render
 from dougong.report.server import ViewServer
 from dougong.report.streaming import prepare
-from dougong.report.viewer import why_missing
 from test_report import building, registration, run_result
 from test_viewer import BEACONS, layers  # noqa: F401 - a fixture
+from viewer_page import NEEDED, Page, browser, change, ink, settled  # noqa: F401 - a fixture
 
-CHROMIUM = os.environ.get("DOUGONG_CHROMIUM") or next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-# Software rendering: the same picture on every machine.
-FLAGS = (
-    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--disable-gpu-sandbox", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
-)  # fmt: skip
-MISSING = why_missing()
-pytestmark = [
-    pytest.mark.skipif(MISSING is not None, reason=f"the viewer is not built: {MISSING}"),
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium; install it or set DOUGONG_CHROMIUM"),
-]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """A headless Chromium."""
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="Playwright is missing: pip install 'dougong[browser]'"
-    )
-    with playwright.sync_playwright() as running:
-        opened = running.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
-        yield opened
-        opened.close()
-
-
-class Page:
-    """A page with a viewer, and what went wrong or out while it was open."""
-
-    def __init__(self, browser, url, **options):
-        self.context = browser.new_context(
-            **{"viewport": {"width": 900, "height": 600}, "reduced_motion": "reduce"} | options
-        )
-        self.tab = self.context.new_page()
-        self.errors, self.requests = [], []
-        self.tab.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.tab.on("console", lambda said: self.errors.append(said.text)
-                    if said.type == "error" else None)  # fmt: skip
-        self.tab.on("request", lambda request: self.requests.append(request.url))
-        self.tab.goto(url)
-        self.tab.wait_for_selector("html.viewer-ready", state="attached", timeout=60_000)
-        self.canvas = self.tab.locator("#viewer canvas")
-        self.canvas.scroll_into_view_if_needed()
-
-    def state(self, words):
-        return self.tab.evaluate(f"() => {{ const s = dougongViewer.state; return {words}; }}")
-
-    def press(self, group, name):
-        self.tab.get_by_role("group", name=group).get_by_role(
-            "button", name=name, exact=True
-        ).click()
-
-    def picture(self):
-        """Return the canvas alone as (h, w, 3), without what lies over it."""
-        self.tab.add_style_tag(content=".viewer .stage > :not(canvas) { visibility: hidden; }")
-        self.tab.evaluate("() => dougongViewer.stage.draw()")
-        self.tab.evaluate("() => new Promise((done) => requestAnimationFrame(() => "
-                          "requestAnimationFrame(done)))")  # fmt: skip
-        data = np.frombuffer(self.canvas.screenshot(), dtype=np.uint8)
-        return cv2.imdecode(data, cv2.IMREAD_COLOR).astype(np.int64)
-
-    def close(self):
-        self.context.close()
-
-
-def ink(picture):
-    """Return the share of pixels that are not the ground's colour."""
-    ground = np.median(picture[:8].reshape(-1, 3), axis=0)
-    return float((np.abs(picture - ground).sum(axis=2) > 40).mean())
-
-
-def change(first, second):
-    return float((np.abs(first - second).sum(axis=2) > 40).mean())
+pytestmark = NEEDED
 
 
 @pytest.fixture(scope="module")
 def report(layers, tmp_path_factory):  # noqa: F811 - the fixture
     path = tmp_path_factory.mktemp("report") / "report.html"
-    path.write_text(render(from_run(run_result(registration()), None), layers), encoding="utf-8")
+    strays = np.random.default_rng(6).uniform([-4, -9, 6], [10, 0, 9], (3000, 3))
+    removed = Removed(after=strays, reasons=np.full(3000, 4, np.uint8))
+    shown = [replace(layers[0], removed=removed), layers[1]]
+    path.write_text(render(from_run(run_result(registration()), None), shown), encoding="utf-8")
     return path.as_uri()
 
 
 @pytest.fixture
-def page(browser, report):
+def page(browser, report):  # noqa: F811 - the fixture
     opened = Page(browser, report)
     yield opened
     assert opened.errors == []
@@ -115,7 +40,7 @@ def page(browser, report):
 
 def test_the_report_draws_and_every_colouring_looks_different(page):
     pictures = {}
-    for name in ("Source", "Height", "Natural", "Distance", "Class"):
+    for name in ("Source", "Height", "Natural", "Distance", "Class", "Removed"):
         page.press("Colour", name)
         pictures[name] = page.picture()
         assert ink(pictures[name]) > 0.1, name
@@ -146,7 +71,7 @@ def test_clouds_views_and_motion_change_the_picture(page):
     page.press("Clouds are", "registered")
     assert change(start, page.picture()) < 0.002
     seen = [start]
-    for view in ("Plan", "Front", "Side"):
+    for view in ("Plan", "Front", "Right", "Left"):
         page.press("View", view)
         seen.append(page.picture())
         assert ink(seen[-1]) > 0.02
@@ -181,9 +106,12 @@ def test_measuring_two_points_gives_their_distance(page):
     result = page.tab.evaluate("() => dougongViewer.measure.result")
     assert result["distance"] == pytest.approx(5.0, abs=1e-6)
     assert result["plan"] == pytest.approx(3.0, abs=1e-6)
-    assert result["rise"] == pytest.approx(4.0, abs=1e-6)
+    steps = [result[name] for name in ("dx", "dy", "dz")]
+    assert steps == pytest.approx((BEACONS[1] - BEACONS[0]).tolist(), abs=1e-6)
     words = page.tab.locator("#viewer .readout").inner_text()
     assert words.startswith("5.000 m")
+    assert "dx +0.000" in words
+    assert "dz +4.000" in words
     assert "500003.000 3999993.000 107.000" in words
     assert "scan <b>1</b>" in words
     page.canvas.focus()
@@ -195,7 +123,9 @@ def test_keys_work_and_are_listed(page):
     page.canvas.focus()
     for key, asked, answer in (("2", "s.view", "plan"), ("c", "s.colour", "height"),
                                ("s", "s.slice", "level"), ("l", "s.stage.lighting", False),
-                               ("r", "s.slice", "off")):  # fmt: skip
+                               ("x", "s.isBoxed", True), ("5", "s.view", "back"),
+                               ("r", "s.slice", "off"),
+                               ("o", "s.stage.isOrtho", True)):  # fmt: skip
         page.tab.keyboard.press(key)
         assert page.state(asked) == answer, key
     page.tab.keyboard.press("?")
@@ -210,7 +140,7 @@ def test_print_shows_the_stills_and_not_the_viewer(page):
 
 
 @pytest.mark.parametrize(("width", "height", "scheme"), [(390, 844, "dark"), (2560, 1440, "light")])
-def test_it_fits_a_phone_and_a_large_screen(browser, report, width, height, scheme):
+def test_it_fits_a_phone_and_a_large_screen(browser, report, width, height, scheme):  # noqa: F811
     opened = Page(browser, report, viewport={"width": width, "height": height}, color_scheme=scheme)
     picture = opened.picture()
     assert ink(picture) > 0.1
@@ -238,14 +168,11 @@ def served(tmp_path):
     server.close()
 
 
-def test_view_streams_clouds_from_this_computer_only(browser, served):
+def test_view_streams_clouds_from_this_computer_only(browser, served):  # noqa: F811
     server, scene = served
     opened = Page(browser, server.url)
     assert all(url.startswith(server.url) for url in opened.requests if url[:5] != "data:")
-    for _ in range(40):
-        opened.tab.wait_for_timeout(250)
-        if opened.tab.evaluate("() => dougongViewer.streamer.isDone === true"):
-            break
+    settled(opened)
     opened.tab.evaluate("() => { dougongViewer.state.setView('plan'); }")
     first = opened.picture()
     assert ink(first) > 0.1
@@ -254,12 +181,172 @@ def test_view_streams_clouds_from_this_computer_only(browser, served):
     assert change(first, opened.picture()) > 0.01
     opened.tab.get_by_label("small.ply").check()
     origin = np.array(opened.state("s.scene.origin"))
-    opened.tab.evaluate("() => { dougongViewer.measure.setOn(true); }")
+    opened.tab.evaluate("() => { dougongViewer.tools.choose('measure'); }")
     for beacon in BEACONS:
         local = beacon + [5e5, 4e6, 100.0] - origin
         x, y = opened.tab.evaluate("(p) => dougongViewer.project(...p)", local.tolist())
         opened.tab.mouse.click(x, y)
     result = opened.tab.evaluate("() => dougongViewer.measure.result")
     assert result["distance"] == pytest.approx(5.0, abs=2e-4)
+    assert opened.errors == []
+    opened.close()
+
+
+LEGENDS = {
+    "Source": ("scan <b>1</b>", "drone"),
+    "Height": ("height above the ground",),
+    "Natural": ("scan <b>1</b>: colours of the file",),
+    "Distance": ("distance to the other cloud", "none within 250 mm"),
+    "Class": ("ground",),
+    "Removed": ("kept", "statistical"),
+}
+
+
+def test_every_colouring_has_its_legend(page):
+    for name, words in LEGENDS.items():
+        page.press("Colour", name)
+        legend = page.tab.locator("#viewer .viewer-legend").inner_text()
+        assert all(word in legend for word in words), (name, legend)
+
+
+def test_removed_points_are_shown_where_the_reason_is_asked_for_and_only_there(page):
+    sky = [3.0, -7.0, 8.0]
+
+    def picked():
+        return page.tab.evaluate(
+            "(p) => { const [x, y] = dougongViewer.stage.project(p);"
+            " return dougongViewer.stage.pick(x, y, 40)?.point[2] ?? null; }", sky,
+        )  # fmt: skip
+
+    page.press("View", "Front")
+    assert (picked() or 0) < 7.5
+    page.press("Colour", "Removed")
+    assert picked() > 5.9
+
+
+def test_the_cut_box_cuts_the_picture_and_its_grips_are_dragged(page):
+    start = page.picture()
+    page.press("View", "Front")
+    before = page.picture()
+    page.tab.locator("#viewer .cut-box").click()
+    low, high = page.state("[s.box.low[2], s.box.high[2]]")
+    page.tab.add_style_tag(content=".viewer .stage > .overlay { visibility: visible !important; }")
+    page.tab.evaluate("() => dougongViewer.stage.draw()")
+    grip = page.tab.get_by_label("upper side of the box, height").bounding_box()
+    x, y = grip["x"] + grip["width"] / 2, grip["y"] + grip["height"] / 2
+    pixels = page.tab.evaluate(
+        "() => dougongViewer.stage.canvas.clientHeight / (2 * dougongViewer.stage.halfHeight)"
+    )
+    page.tab.mouse.move(x, y)
+    page.tab.mouse.down()
+    page.tab.mouse.move(x, y + 20)
+    page.tab.mouse.move(x, y + 50)
+    page.tab.mouse.up()
+    assert page.state("s.box.high[2]") == pytest.approx(high - 50 / pixels, abs=2 / pixels)
+    page.state(f"s.setBoxSide(2, 'high', {(low + high) / 2})")
+    half = page.picture()
+    assert ink(half) < 0.8 * ink(before)
+    page.tab.get_by_label("lower side of the box, along").focus()
+    along = page.state("s.box.low[0]")
+    page.tab.keyboard.press("ArrowUp")
+    assert page.state("s.box.low[0]") == pytest.approx(along + 0.1)
+    size = page.tab.locator("#viewer .row:has(.whole-box) .where").inner_text()
+    assert size.startswith("box ")
+    assert size.endswith(f"× {(high - low) / 2:.2f} m")
+    page.tab.get_by_role("button", name="Reset").click()
+    assert change(start, page.picture()) < 0.002
+
+
+def test_an_upright_section_runs_through_two_clicked_places(page):
+    page.press("Thin slice", "Drawn")
+    assert page.state("s.view") == "plan"
+    places = [[-2.0, -8.0, 0.0], [8.0, -2.0, 0.0]]
+    for place in places:
+        x, y = page.tab.evaluate("(p) => dougongViewer.project(...p)", place)
+        page.tab.mouse.click(x, y)
+    assert page.state("s.slice") == "drawn"
+    a, b = page.state("[s.line.a, s.line.b]")
+    # A click takes the point that is there, some centimetres from where it was aimed.
+    assert np.hypot(*(np.array(a) - places[0])[:2]) < 1.5
+    normal = page.state("s.slab.normal")
+    assert abs(np.dot(normal[:2], np.subtract(b, a)[:2])) < 1e-9
+    cut = page.picture()
+    assert 0.0005 < ink(cut) < 0.1
+    page.canvas.focus()
+    where = page.state("s.positionMetres")
+    page.tab.keyboard.press("]")
+    assert page.state("s.positionMetres") == pytest.approx(where + page.state("s.thickness") / 2)
+    box = page.canvas.bounding_box()
+    page.tab.mouse.move(box["x"] + 200, box["y"] + 200)
+    page.tab.keyboard.down("Shift")
+    page.tab.mouse.wheel(0, 120)
+    page.tab.keyboard.up("Shift")
+    page.tab.wait_for_function(
+        "(was) => Math.abs(dougongViewer.state.positionMetres - was) < 1e-9", arg=where
+    )
+
+
+def test_a_slice_is_dragged_by_its_grip(page):
+    page.press("Thin slice", "Level")
+    page.press("View", "Front")
+    start = page.state("s.positionMetres")
+    grip = page.tab.get_by_label("move the slice").bounding_box()
+    x, y = grip["x"] + grip["width"] / 2, grip["y"] + grip["height"] / 2
+    page.tab.mouse.move(x, y)
+    page.tab.mouse.down()
+    page.tab.mouse.move(x, y - 40, steps=4)
+    page.tab.mouse.up()
+    per_metre = page.tab.evaluate(
+        "() => dougongViewer.stage.canvas.clientHeight / (2 * dougongViewer.stage.halfHeight)"
+    )
+    assert page.state("s.positionMetres") - start == pytest.approx(40 / per_metre, rel=0.15)
+
+
+def test_fit_brings_everything_into_the_picture(page):
+    page.press("View", "Front")
+    page.tab.evaluate("() => { const st = dougongViewer.stage; st.orthographic.zoom = 30;"
+                      " st.controls.target.z += 40; st.camera.position.z += 40;"
+                      " st.controls.update(); }")  # fmt: skip
+    assert ink(page.picture()) < 0.01
+    page.tab.locator("#viewer .fit").click()
+    assert ink(page.picture()) > 0.05
+    ends = page.tab.evaluate(
+        "() => { const st = dougongViewer.stage; let out = 0, all = 0;"
+        " st.sample(4000, (x, y, z) => { const [u, v] = st.project([x, y, z]); all += 1;"
+        " if (u < 0 || v < 0 || u > st.canvas.clientWidth || v > st.canvas.clientHeight) out += 1;"
+        " }); return out / all; }"
+    )
+    assert ends < 0.02
+
+
+def test_a_parallel_view_snaps_to_the_side_that_it_is_near(page):
+    page.press("View", "Front")
+    turn = (
+        "(deg) => { const st = dougongViewer.stage, t = st.controls.target,"
+        " p = st.camera.position, a = deg * Math.PI / 180, x = p.x - t.x, y = p.y - t.y;"
+        " p.set(t.x + x * Math.cos(a) - y * Math.sin(a), t.y + x * Math.sin(a) + y * Math.cos(a),"
+        " p.z); st.controls.update(); dougongViewer.state.view = ''; dougongViewer.state.snap(); }"
+    )
+    page.tab.evaluate(turn, 3)
+    assert page.state("s.view") == "front"
+    page.tab.evaluate(turn, 20)
+    assert page.state("s.view") == ""
+
+
+def test_fingers_turn_and_measure(browser, report):  # noqa: F811
+    opened = Page(browser, report, viewport={"width": 390, "height": 700}, has_touch=True)
+    touch = "() => getComputedStyle(dougongViewer.stage.canvas).touchAction"
+    assert opened.tab.evaluate(touch) == "pan-y", (
+        "a finger on an untouched picture scrolls the page"
+    )
+    opened.press("View", "Plan")
+    opened.tab.get_by_role("button", name="Measure").click()
+    opened.canvas.scroll_into_view_if_needed()
+    for beacon in BEACONS:
+        x, y = opened.tab.evaluate("(p) => dougongViewer.project(...p)", beacon.tolist())
+        opened.tab.touchscreen.tap(x, y)
+    distance = opened.tab.evaluate("() => dougongViewer.measure.result.distance")
+    assert distance == pytest.approx(5.0, abs=1e-6)
+    assert opened.tab.evaluate(touch) == "none"
     assert opened.errors == []
     opened.close()

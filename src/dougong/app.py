@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from dougong.registration import Register
     from dougong.registration.result import Registration
     from dougong.report.server import ViewServer
+    from dougong.report.streaming import Scene as Shown
     from dougong.typing import Kind
 
 Document = dict[str, Any]
@@ -517,8 +518,11 @@ def view(
     open_browser: bool,
     work: Path | None,
     progress: Progress,
+    pairs: Path | None = None,
 ) -> Viewing:
     """Serve clouds or result folders to the browser of this computer.
+
+    `pairs` is the CSV file that places picked in two clouds go to.
 
     Raises
     ------
@@ -536,8 +540,8 @@ def view(
         work.mkdir(parents=True, exist_ok=True)
     scratch = TemporaryDirectory(prefix="dougong-view-", dir=work, ignore_cleanup_errors=True)
     try:
-        scene = prepare(paths, Path(scratch.name), progress.stage)
-        server = _view_server(ViewServer, scene.things, port)
+        scene = prepare(paths, Path(scratch.name), progress.stage, pairs)
+        server = _view_server(ViewServer, scene, port)
     except BaseException:
         scratch.cleanup()
         raise
@@ -551,9 +555,9 @@ def view(
     return Viewing(document, server, scratch)
 
 
-def _view_server(make: type[ViewServer], things: Any, port: int) -> ViewServer:
+def _view_server(make: type[ViewServer], scene: Shown, port: int) -> ViewServer:
     try:
-        return make(things, port)
+        return make(scene.things, port, scene.takes)
     except (OSError, OverflowError) as error:
         msg = f"port {port} cannot be used ({error}). Pass another --port, or none."
         raise InputError(msg) from error

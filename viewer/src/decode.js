@@ -10,6 +10,15 @@ async function inflated(element) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
+// Class and reason of removal in one byte, as the shader takes them apart.
+export const packed = (code, reason) => Math.min(code, 31) + 32 * Math.min(reason, 7);
+
+// A signed distance (metres) as a byte: 127 is zero, 255 none.
+export function residualCode(metres, most) {
+  if (!Number.isFinite(metres)) return 255;
+  return 127 + Math.round(Math.sign(metres) * 127 * Math.sqrt(Math.min(Math.abs(metres) / most, 1)));
+}
+
 export async function decode(cloud) {
   const raw = await inflated(document.getElementById(cloud.element));
   const n = cloud.points;
@@ -39,6 +48,7 @@ export async function decode(cloud) {
   } else colour.fill(150);
   fill(info, 0, new Uint8Array(n).fill(cloud.source), 4);
   fill(info, 1, cloud.has_residual ? plane() : new Uint8Array(n).fill(255), 4);
-  if (cloud.has_class) fill(info, 2, plane(), 4);
+  const classes = cloud.has_class ? plane() : null, reasons = cloud.has_reason ? plane() : null;
+  for (let i = 0; i < n; i++) info[4 * i + 2] = packed(classes?.[i] ?? 0, reasons?.[i] ?? 0);
   return { position, colour, info, spacing: cloud.spacing_m };
 }

@@ -13,6 +13,8 @@ export function h(tag, attributes = {}, ...children) {
 
 export const metres = (value, unit = "m", digits = 3) => `${value.toFixed(digits)} ${unit}`;
 
+export const signed = (value, digits = 3) => `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(digits)}`;
+
 export function roundLength(value) {
   const power = 10 ** Math.floor(Math.log10(value));
   return [5, 2, 1].map((step) => step * power).find((step) => step <= value * (1 + 1e-9));

@@ -1,96 +1,73 @@
 // Measuring between two picked points, drawn over the picture.
-import { metres } from "./dom.js";
-
-const SVG = "http://www.w3.org/2000/svg";
+import { metres, signed } from "./dom.js";
+import { svg } from "./tools.js";
 
 export class Measure {
-  constructor(stage, overlay, say) {
+  constructor(stage) {
     this.stage = stage;
-    this.overlay = overlay;
-    this.say = say;
-    this.isOn = false;
     this.points = [];
-    stage.onDraw.add(() => this.draw());
-    let down = null;
-    stage.canvas.addEventListener("pointerdown", (event) => {
-      down = event.isPrimary ? [event.clientX, event.clientY] : null;
-    });
-    stage.canvas.addEventListener("pointerup", (event) => {
-      const moved = down ? Math.hypot(event.clientX - down[0], event.clientY - down[1]) : Infinity;
-      if (this.isOn && moved < 5 && event.button === 0) this.click(event);
-    });
-  }
-
-  setOn(isOn) {
-    this.isOn = isOn;
-    this.stage.canvas.classList.toggle("measuring", isOn);
-    this.clear();
-    this.say(isOn ? "Click the first point." : "");
+    this.hint = "Click the first point.";
   }
 
   clear() {
     this.points = [];
-    if (this.isOn) this.say("Click the first point.");
-    this.stage.invalidate();
   }
 
-  click(event) {
-    const box = this.stage.canvas.getBoundingClientRect();
-    const reach = event.pointerType === "touch" ? 18 : 8;
-    const found = this.stage.pick(event.clientX - box.left, event.clientY - box.top, reach);
-    if (!found) {
-      this.say("There is no point there; click on a point.");
-      return;
-    }
+  pick(found) {
     if (this.points.length === 2) this.points = [];
     this.points.push(found);
-    this.say(this.words());
-    this.stage.invalidate();
+    return this.words();
   }
 
   get result() {
     if (this.points.length < 2) return null;
     const [a, b] = this.points.map((found) => found.point);
     const [dx, dy, dz] = a.map((value, axis) => b[axis] - value);
-    return { distance: Math.hypot(dx, dy, dz), plan: Math.hypot(dx, dy), rise: dz };
+    return { distance: Math.hypot(dx, dy, dz), plan: Math.hypot(dx, dy), dx, dy, dz };
+  }
+
+  // Coordinates as the file has them (metres), to the digit that the picture holds.
+  place(found) {
+    const { sources, origin, precision_m: precision } = this.stage.scene;
+    const source = sources[found.source];
+    const name = source?.name ?? "";
+    if (this.stage.progress < 1 && source?.motion) return `${name}: shown as delivered, not in the result's coordinates`;
+    const digits = precision && precision > 4e-4 ? 3 : 4;
+    const from = source?.origin ?? origin;
+    return `${name}: ${found.point.map((value, axis) => (value + from[axis]).toFixed(digits)).join("  ")}`;
   }
 
   words() {
-    const { sources, origin, precision_m: precision } = this.stage.scene;
-    const place = (found) => {
-      const at = found.point.map((value, axis) => (value + origin[axis]).toFixed(3)).join("  ");
-      return `${sources[found.source]?.name ?? ""}: ${at}`;
-    };
-    const lines = this.points.map(place);
-    const result = this.result;
+    const lines = this.points.map((found, index) => `${"AB"[index]}  ${this.place(found)}`);
+    const { result } = this;
     if (!result) return `${lines[0]}\nClick the second point.`;
-    const { distance, plan, rise } = result;
+    const { distance, plan, dx, dy, dz } = result;
+    const { precision_m: precision } = this.stage.scene;
     // Both ends may be off by `precision` along all three axes.
     const most = 2 * Math.sqrt(3) * precision * 1000;
     const doubt = precision ? ` (rounding: ${most.toFixed(1)} mm at most)` : "";
     return [
-      `${metres(distance)}${doubt}`, `in plan ${metres(plan)}, rise ${metres(rise)}`, ...lines,
+      `${metres(distance)}${doubt}`, `in plan ${metres(plan)}, heading ${heading(dx, dy)}`,
+      `dx ${signed(dx)}   dy ${signed(dy)}   dz ${signed(dz)}`, ...lines,
     ].join("\n");
   }
 
-  draw() {
-    this.overlay.replaceChildren();
+  draw(layer) {
     const at = this.points.map((found) => this.stage.project(found.point));
-    const add = (tag, attributes) => {
-      const node = document.createElementNS(SVG, tag);
-      for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
-      this.overlay.append(node);
-      return node;
-    };
     if (at.length === 2) {
       const [[x1, y1], [x2, y2]] = at;
-      for (const kind of ["halo", "ruler"]) add("line", { class: kind, x1, y1, x2, y2 });
-      const label = add("text", { x: (x1 + x2) / 2, y: (y1 + y2) / 2 - 10 });
-      label.textContent = metres(this.result.distance);
+      for (const kind of ["halo", "ruler"]) svg(layer, "line", { class: kind, x1, y1, x2, y2 });
+      svg(layer, "text", { x: (x1 + x2) / 2, y: (y1 + y2) / 2 - 10 }, metres(this.result.distance));
     }
-    for (const [cx, cy] of at) {
-      add("circle", { class: "halo", cx, cy, r: 6 });
-      add("circle", { class: "ruler", cx, cy, r: 6 });
-    }
+    at.forEach(([cx, cy], index) => {
+      for (const kind of ["halo", "ruler"]) svg(layer, "circle", { class: kind, cx, cy, r: 6 });
+      svg(layer, "text", { class: "small", x: cx + 13, y: cy - 8 }, "AB"[index]);
+    });
   }
+}
+
+// Of the way from A to B: degrees from the grid's north (+y), clockwise.
+function heading(dx, dy) {
+  if (Math.hypot(dx, dy) < 1e-3) return "–";
+  return `${(((Math.atan2(dx, dy) * 180) / Math.PI + 360) % 360).toFixed(1)}°`;
 }

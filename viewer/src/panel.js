@@ -1,35 +1,19 @@
 // The controls: buttons that call the state, and that show what it says.
-import { CLASSES, HEIGHT, RESIDUAL, hex } from "./colours.js";
+import { hex } from "./colours.js";
 import { h } from "./dom.js";
+import { toggleFull } from "./keys.js";
 import { SLICES, THICKNESSES, VIEWS } from "./state.js";
 
 const WORDS = {
-  source: "Source", height: "Height", natural: "Natural", residual: "Distance", class: "Class",
-  iso: "Corner", plan: "Plan", front: "Front", side: "Side",
-  off: "Off", level: "Level", along: "Along", across: "Across",
+  source: "Source", height: "Height", natural: "Natural", residual: "Distance", class: "Class", reason: "Removed",
+  iso: "Corner", plan: "Plan", front: "Front", right: "Right", back: "Back", left: "Left",
+  off: "Off", level: "Level", along: "Along", across: "Across", drawn: "Drawn",
 };
-
-export const KEYS = [
-  ["1 2 3 4", "corner, plan, front, side"],
-  ["C", "next colouring"],
-  ["B", "as delivered / registered"],
-  ["S", "next slice"],
-  ["[ ]", "move the slice by half its thickness"],
-  ["M", "measure between two points; Esc ends it"],
-  ["+ −", "larger, smaller points"],
-  ["L", "depth shading on or off"],
-  ["O", "parallel or perspective view"],
-  ["F", "full screen"],
-  ["R", "reset everything"],
-  ["? or H", "this list"],
-  ["drag", "turn; with the right button or two fingers: move"],
-  ["wheel, pinch", "nearer or farther (in a page: after a click into the picture)"],
-];
 
 let groups = 0;
 
 // A row of buttons of which one is pressed.
-function choice(label, names, current, choose, refreshers) {
+export function choice(label, names, current, choose, refreshers) {
   const id = `viewer-group-${(groups += 1)}`;
   const buttons = names.map((name) =>
     h("button", { type: "button", "data-value": name, onclick: () => choose(name) }, WORDS[name] ?? name));
@@ -46,9 +30,10 @@ function slider(label, attributes, oninput) {
   return input;
 }
 
-export function makePanel(state, measure, root) {
+const button = (words, onclick, more = {}) => h("button", { type: "button", onclick, ...more }, words);
+
+export function makePanel(state, tools, root, help, extras = []) {
   const refreshers = [];
-  const { scene } = state;
   const parts = [];
   if (state.hasMotion) {
     parts.push(choice("Clouds are", ["as delivered", "registered"],
@@ -57,19 +42,15 @@ export function makePanel(state, measure, root) {
   }
   parts.push(clouds(state, refreshers));
   parts.push(choice("Colour", state.colours, () => state.colour, (name) => state.setColour(name), refreshers));
-  parts.push(choice("View", VIEWS, () => state.view, (name) => state.setView(name), refreshers));
-  parts.push(slices(state, refreshers));
-  const help = h("dialog", { class: "help" });
-  help.append(h("h3", {}, "Keys"),
-    h("table", {}, ...KEYS.map(([key, does]) => h("tr", {}, h("th", {}, key), h("td", {}, does)))),
-    h("button", { type: "button", onclick: () => help.close() }, "Close"));
-  parts.push(tools(state, measure, root, help, refreshers));
+  const views = choice("View", VIEWS, () => state.view, (name) => state.setView(name), refreshers);
+  views.querySelector(".buttons").append(button("Fit", () => state.fit(), { class: "fit", title: "fit what is shown into the picture" }));
+  parts.push(views, slices(state, tools, refreshers), useTools(state, tools, root, help, refreshers), ...extras);
   const panel = h("div", { class: "panel" }, ...parts);
   const refresh = () => refreshers.forEach((refresher) => refresher());
   state.addEventListener("change", refresh);
+  tools.addEventListener("change", refresh);
   refresh();
-  root.addEventListener("keydown", (event) => onKey(event, state, measure, root, help));
-  return { panel, help, scene };
+  return panel;
 }
 
 function clouds(state, refreshers) {
@@ -78,13 +59,13 @@ function clouds(state, refreshers) {
     input.addEventListener("change", () => state.setShown(index, input.checked));
     refreshers.push(() => { input.checked = state.shown[index]; });
     const swatch = h("i", { class: "swatch", style: `background:${hex(source.colour)}` });
-    return h("label", { class: "cloud" }, input, swatch, h("span", {}, source.name),
+    return h("label", { class: "cloud" }, input, swatch, h("span", { title: source.name }, source.name),
       source.role ? h("small", {}, source.role) : null);
   });
   return h("div", { class: "group" }, h("span", { class: "label" }, "Show"), ...boxes);
 }
 
-function slices(state, refreshers) {
+function slices(state, tools, refreshers) {
   const where = h("output", { class: "where" });
   const position = slider("position of the slice", { min: 0, max: 1, step: "any", class: "slice-position" },
     (value) => state.setPosition(value));
@@ -100,87 +81,36 @@ function slices(state, refreshers) {
     thickness.value = state.thickness;
     where.textContent = state.where;
   });
-  const row = choice("Thin slice", SLICES, () => state.slice, (name) => state.setSlice(name), refreshers);
+  const isDrawing = () => tools.isOn("section");
+  const row = choice("Thin slice", SLICES, () => (isDrawing() ? "drawn" : state.slice), (name) => {
+    if (name === "drawn" && !(state.line && state.slice !== "drawn")) return tools.toggle("section");
+    if (isDrawing()) tools.choose(null);
+    return state.setSlice(name);
+  }, refreshers);
   row.append(more);
   return row;
 }
 
-function tools(state, measure, root, help, refreshers) {
-  const ruler = h("button", { type: "button", class: "measure", onclick: () => toggleMeasure(state, measure) }, "Measure");
-  const shading = h("button", { type: "button", onclick: () => state.setLighting(!state.stage.lighting) }, "Shading");
-  const full = h("button", { type: "button", onclick: () => toggleFull(root) }, "Full screen");
+function useTools(state, tools, root, help, refreshers) {
+  const ruler = button("Measure", () => tools.toggle("measure"), { class: "measure" });
+  const shading = button("Shading", () => state.setLighting(!state.stage.lighting));
+  const box = button("Cut box", () => state.setBoxed(!state.isBoxed), { class: "cut-box" });
+  const edges = h("output", { class: "where" });
+  const boxed = h("div", { class: "row" }, edges, button("Whole", () => state.resetBox(), { class: "whole-box" }));
   const size = slider("size of the points", { min: -2, max: 2, step: 0.1 }, (value) => state.setSize(2 ** value));
   refreshers.push(() => {
-    ruler.setAttribute("aria-pressed", measure.isOn);
+    ruler.setAttribute("aria-pressed", tools.isOn("measure"));
     shading.setAttribute("aria-pressed", state.stage.lighting);
+    box.setAttribute("aria-pressed", state.isBoxed);
+    boxed.hidden = !state.isBoxed;
+    edges.textContent = `box ${state.box.high.map((value, k) => (value - state.box.low[k]).toFixed(2)).join(" × ")} m`;
     size.value = Math.log2(state.size);
   });
   return h("div", { class: "group" }, h("span", { class: "label" }, "Tools"),
-    h("div", { class: "buttons" }, ruler, shading, document.fullscreenEnabled ? full : null,
-      h("button", { type: "button", onclick: () => { measure.setOn(false); state.reset(); } }, "Reset"),
-      h("button", { type: "button", onclick: () => help.showModal() }, "Keys")),
+    h("div", { class: "buttons" }, ruler, box, shading,
+      document.fullscreenEnabled ? button("Full screen", () => toggleFull(root)) : null,
+      button("Reset", () => { tools.choose(null); state.reset(); }),
+      button("Keys", () => help.showModal())),
+    boxed,
     h("label", { class: "size" }, h("span", {}, "Points"), size));
-}
-
-function toggleMeasure(state, measure) {
-  measure.setOn(!measure.isOn);
-  state.changed();
-}
-
-function toggleFull(root) {
-  if (document.fullscreenElement) document.exitFullscreen();
-  else root.requestFullscreen();
-}
-
-const next = (names, current) => names[(names.indexOf(current) + 1) % names.length];
-
-function onKey(event, state, measure, root, help) {
-  const { tagName, type } = event.target;
-  if (event.ctrlKey || event.metaKey || event.altKey || tagName === "SELECT" || type === "text") return;
-  const view = VIEWS[Number(event.key) - 1];
-  const act = {
-    c: () => state.setColour(next(state.colours, state.colour)),
-    b: () => state.hasMotion && state.setRegistered(!state.isRegistered),
-    s: () => state.setSlice(next(SLICES, state.slice)),
-    "[": () => state.slice !== "off" && state.setPosition(state.position[state.slice] - state.step),
-    "]": () => state.slice !== "off" && state.setPosition(state.position[state.slice] + state.step),
-    m: () => toggleMeasure(state, measure),
-    escape: () => { measure.setOn(false); state.changed(); },
-    "+": () => state.setSize(state.size * 1.25),
-    "=": () => state.setSize(state.size * 1.25),
-    "-": () => state.setSize(state.size / 1.25),
-    l: () => state.setLighting(!state.stage.lighting),
-    o: () => state.stage.setOrtho(!state.stage.isOrtho),
-    f: () => toggleFull(root),
-    r: () => { measure.setOn(false); state.reset(); },
-    h: () => help.showModal(),
-    "?": () => help.showModal(),
-  }[event.key.toLowerCase()];
-  if (!view && !act) return;
-  event.preventDefault();
-  if (view) state.setView(view);
-  else act();
-}
-
-// What the colours mean, over the picture.
-export function makeLegend(state) {
-  const legend = h("div", { class: "viewer-legend" });
-  const ramp = (stops, low, high, title) => [
-    h("span", {}, title), h("span", { class: "ramp" }, h("span", {}, low),
-      h("i", { style: `background:linear-gradient(90deg,${stops.join(",")})` }), h("span", {}, high))];
-  const { scene } = state;
-  const kinds = {
-    source: () => scene.sources.map((source) => h("span", { class: "key" },
-      h("i", { class: "swatch", style: `background:${hex(source.colour)}` }), source.name)),
-    height: () => ramp(HEIGHT, "0", `${(scene.top - scene.floor).toFixed(1)} m`, "height above the ground"),
-    natural: () => [scene.natural ?? "colours of the files"],
-    residual: () => [...ramp(RESIDUAL, "0", `${Math.round(scene.residual.shown_m * 1000)} mm`, "distance to the other cloud"),
-      h("span", { class: "key" }, h("i", { class: "swatch", style: "background:#8c8c8c" }),
-        `none within ${Math.round(scene.residual.reach_m * 1000)} mm`)],
-    class: () => CLASSES.filter(([code]) => !scene.classes || scene.classes.includes(code)).map(([, name, colour]) =>
-      h("span", { class: "key" }, h("i", { class: "swatch", style: `background:${colour}` }), name)),
-  };
-  state.addEventListener("change", () => legend.replaceChildren(...kinds[state.colour]()));
-  legend.replaceChildren(...kinds[state.colour]());
-  return legend;
 }

@@ -1,11 +1,14 @@
 // What is drawn: points, cameras, lighting. Draws only when something has changed.
 import {
   BufferAttribute, BufferGeometry, Color, DepthTexture, GLSL3, Mesh, Matrix4, NearestFilter,
-  OrthographicCamera, PerspectiveCamera, PlaneGeometry, Points, Quaternion, Scene, ShaderMaterial,
+  OrthographicCamera, PerspectiveCamera, PlaneGeometry, Points, Scene, ShaderMaterial,
   UnsignedIntType, Vector2, Vector3, Vector4, WebGLRenderer, WebGLRenderTarget,
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
-import { HEIGHT, RESIDUAL, classColours } from "./colours.js";
+import { HEIGHT, RESIDUAL, SIGNED, classColours, reasonColours } from "./colours.js";
+import { motionOf } from "./motion.js";
+import { Pace, interleaved } from "./pace.js";
+import { pick } from "./pick.js";
 import {
   EYE_DOME_FRAGMENT, MAX_SOURCES, POINT_FRAGMENT, POINT_VERTEX, SCREEN_VERTEX,
 } from "./shaders.js";
@@ -33,9 +36,12 @@ export class Stage {
     this.makeLighting();
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();
-    const loop = () => {
+    this.pace = new Pace(this);
+    const loop = (now) => {
+      if (this.isDisposed) return;
       requestAnimationFrame(loop);
       if (this.animation) this.animation();
+      this.pace.tick(now, this.isStale);
       if (this.isStale) this.draw();
     };
     requestAnimationFrame(loop);
@@ -51,8 +57,13 @@ export class Stage {
       motion: { value: Array.from({ length: MAX_SOURCES }, () => new Matrix4()) },
       source: { value: shown },
       heightRamp: { value: HEIGHT.map(colourOf) },
-      residualRamp: { value: RESIDUAL.map(colourOf) },
+      residualRamp: { value: (residual?.is_signed ? SIGNED : RESIDUAL).map(colourOf) },
       classes: { value: classColours().map(colourOf) },
+      reasons: { value: reasonColours().map(colourOf) },
+      box: { value: [0, 1, 2].map(() => new Vector4()) },
+      boxHalf: { value: new Vector3(-1, -1, -1) },
+      showRemoved: { value: 0 },
+      isSigned: { value: residual?.is_signed ? 1 : 0 },
       slab: { value: new Vector4(0, 0, 1, 0) },
       slabHalf: { value: -1 },
       mode: { value: 0 },
@@ -62,8 +73,11 @@ export class Stage {
       pixelsPerMetre: { value: 1 },
       isOrtho: { value: 0 },
       minSize: { value: 1.5 },
-      maxSize: { value: 14 },
+      maxSize: { value: 22 },
       opacity: { value: 1 },
+      thinned: { value: 1 },
+      near: { value: 1 },
+      far: { value: 2 },
     };
     this.motions = sources.map((source) => motionOf(source, this.scene.centre));
     this.progress = 1;
@@ -78,6 +92,8 @@ export class Stage {
     this.controls.zoomToCursor = true;
     this.controls.addEventListener("change", () => this.invalidate());
     this.controls.listenToKeyEvents(this.canvas);
+    this.controls.addEventListener("start", () => this.pace.begin());
+    this.controls.addEventListener("end", () => this.pace.end());
   }
 
   makeLighting() {
@@ -106,7 +122,8 @@ export class Stage {
 
   // position: Float32Array (3n), metres about the scene's origin; colour: Uint8Array (3n);
   // info: Uint8Array (4n), see shaders. Returns the chunk, to be given to `remove`.
-  add({ position, colour, info, spacing }) {
+  add(points_) {
+    const { position, colour, info, spacing } = interleaved(points_);
     const geometry = new BufferGeometry();
     geometry.setAttribute("position", new BufferAttribute(position, 3));
     geometry.setAttribute("colour", new BufferAttribute(colour, 3, true));
@@ -132,7 +149,8 @@ export class Stage {
   }
 
   materialFor(spacing) {
-    const key = spacing.toPrecision(3);
+    // In eighths of an octave: chunks share materials.
+    const key = (2 ** (Math.round(8 * Math.log2(spacing)) / 8)).toPrecision(6);
     if (!this.materials.has(key)) {
       const code = (this.scene.residual?.code_max_m ?? 1).toFixed(6);
       const material = new ShaderMaterial({
@@ -159,6 +177,20 @@ export class Stage {
     this.uniforms.slabHalf.value = half;
     this.uniforms.opacity.value = half >= 0 ? 0.6 : 1;
     for (const material of this.materials.values()) this.applySliceStyle(material);
+    this.invalidate();
+  }
+
+  // axes: three unit vectors; low, high: metres along them, about `origin`. Null: no box.
+  setBox(axes, origin, low, high) {
+    if (!axes) {
+      this.uniforms.boxHalf.value.set(-1, -1, -1);
+    } else {
+      axes.forEach((axis, k) => {
+        const middle = axis.reduce((sum, value, i) => sum + value * origin[i], 0) + (low[k] + high[k]) / 2;
+        this.uniforms.box.value[k].set(...axis, middle);
+      });
+      this.uniforms.boxHalf.value.set(...high.map((value, k) => (value - low[k]) / 2));
+    }
     this.invalidate();
   }
 
@@ -190,7 +222,7 @@ export class Stage {
   }
 
   get aspect() {
-    return this.canvas.clientWidth / Math.max(1, this.canvas.clientHeight);
+    return Math.max(1, this.canvas.clientWidth) / Math.max(1, this.canvas.clientHeight);
   }
 
   get isOrtho() {
@@ -247,9 +279,9 @@ export class Stage {
     u.pixelsPerMetre.value = this.isOrtho ? pixels / (2 * this.halfHeight) : pixels / (2 * HALF);
     const isSlice = u.slabHalf.value >= 0;
     u.minSize.value = (isSlice ? 3 : 1.5) * this.ratio;
-    u.maxSize.value = (isSlice ? 4 : 14) * this.ratio;
-    s.near.value = camera.near;
-    s.far.value = camera.far;
+    u.maxSize.value = (isSlice ? 4 : 22) * this.ratio;
+    u.near.value = s.near.value = camera.near;
+    u.far.value = s.far.value = camera.far;
     s.pixelAngle.value = (2 * HALF) / pixels;
     s.metresPerPixel.value = (2 * this.halfHeight) / pixels;
     s.strength.value = isSlice || !this.lighting ? 0 : 1;
@@ -272,73 +304,80 @@ export class Stage {
     for (const listener of this.onDraw) listener();
   }
 
+  // Gives the graphics memory back; the stage draws no more.
+  dispose() {
+    this.isDisposed = true;
+    for (const chunk of [...this.chunks]) this.remove(chunk);
+    this.controls.dispose();
+    this.target.depthTexture.dispose();
+    this.target.dispose();
+    this.renderer.dispose();
+    this.renderer.forceContextLoss();
+  }
+
   invalidate() {
     this.isStale = true;
   }
 
+  // The camera as the next picture will have it.
+  ready() {
+    if (this.isStale) this.prepareCamera();
+    else this.camera.updateMatrixWorld();
+  }
+
   // Local metres to CSS pixels of the canvas; z in -1..1 where it is in front of the camera.
   project(point) {
-    this.camera.updateMatrixWorld();
+    this.ready();
     const at = new Vector3(...point).project(this.camera);
     return [((at.x + 1) / 2) * this.canvas.clientWidth, ((1 - at.y) / 2) * this.canvas.clientHeight, at.z];
   }
 
-  // The point under a place of the canvas (CSS pixels): of those near the place, the one in front.
-  pick(x, y, reachPixels = 7) {
-    this.camera.updateMatrixWorld();
-    const view = new Matrix4().multiplyMatrices(this.camera.projectionMatrix, this.camera.matrixWorldInverse);
-    const width = this.canvas.clientWidth, height = this.canvas.clientHeight;
-    const { slab, slabHalf, source, motion } = this.uniforms;
-    const half = slabHalf.value, cut = slab.value;
-    const eye = this.camera.position, ahead = this.camera.getWorldDirection(new Vector3());
-    let best = null, bestScore = Infinity;
-    for (const chunk of this.chunks) {
-      if (!chunk.visible) continue;
-      const { position, info } = chunk.userData;
-      for (let i = 0; i < position.length; i += 3) {
-        const own = info[(4 * i) / 3];
-        if (source.value[own].w < 0.5) continue;
-        const m = motion.value[own].elements, e = view.elements;
-        const a = position[i], b = position[i + 1], c = position[i + 2];
-        const px = m[0] * a + m[4] * b + m[8] * c + m[12];
-        const py = m[1] * a + m[5] * b + m[9] * c + m[13];
-        const pz = m[2] * a + m[6] * b + m[10] * c + m[14];
-        if (half >= 0 && Math.abs(px * cut.x + py * cut.y + pz * cut.z - cut.w) > half) continue;
-        const w = e[3] * px + e[7] * py + e[11] * pz + e[15];
-        if (w <= 0) continue;
-        const sx = ((e[0] * px + e[4] * py + e[8] * pz + e[12]) / w + 1) * 0.5 * width - x;
-        const sy = (1 - (e[1] * px + e[5] * py + e[9] * pz + e[13]) / w) * 0.5 * height - y;
-        const off = Math.hypot(sx, sy);
-        if (off > reachPixels) continue;
-        // A step towards the eye counts for a third of a step sideways on the picture.
-        const depth = (px - eye.x) * ahead.x + (py - eye.y) * ahead.y + (pz - eye.z) * ahead.z;
-        const pixel = this.isOrtho ? (2 * this.halfHeight) / height : (2 * HALF * w) / height;
-        const score = half >= 0 ? off : off + (0.35 * depth) / pixel;
-        if (score < bestScore) {
-          bestScore = score;
-          best = { point: [px, py, pz], source: own, off };
-        }
+  // Where the line of sight through a place of the canvas meets the level z (local metres).
+  onPlane([x, y], z) {
+    this.ready();
+    const ends = [-1, 1].map((depth) => new Vector3(
+      (2 * x) / this.canvas.clientWidth - 1, 1 - (2 * y) / this.canvas.clientHeight, depth).unproject(this.camera));
+    const along = ends[1].clone().sub(ends[0]);
+    const share = Math.abs(along.z) < 1e-9 ? 0 : (z - ends[0].z) / along.z;
+    return ends[0].addScaledVector(along, share).toArray();
+  }
+
+  pick(x, y, reachPixels) {
+    return pick(this, x, y, reachPixels);
+  }
+
+  // Calls visit(x, y, z, source) for about `most` of the points that are drawn, evenly.
+  sample(most, visit) {
+    const shown = [...this.chunks].filter((chunk) => chunk.visible);
+    const total = shown.reduce((sum, chunk) => sum + chunk.userData.position.length / 3, 0);
+    const stride = Math.max(1, Math.floor(total / most));
+    for (const { userData: { position, info } } of shown) {
+      for (let k = 0; k < info.length / 4; k += stride) {
+        const at = this.shownAt(position, info, k);
+        if (at) visit(...at, info[4 * k]);
       }
     }
-    return best;
   }
-}
 
-// Returns (share, matrix): fills the matrix that shows a cloud `share` of the way from where it was
-// registered (0) back to where it was delivered (1), turning about the cloud's own middle.
-function motionOf(source, fallback) {
-  if (!source.motion) return (_, matrix) => matrix.identity();
-  const back = new Matrix4().set(...source.motion);
-  const centre = new Vector3(...(source.centre ?? fallback));
-  const shift = centre.clone().applyMatrix4(back).sub(centre);
-  const turn = new Quaternion(), size = new Vector3(), still = new Quaternion();
-  back.decompose(new Vector3(), turn, size);
-  const rotation = new Quaternion(), at = new Vector3();
-  return (share, matrix) => {
-    rotation.slerpQuaternions(still, turn, share);
-    const scale = 1 + (size.x - 1) * share;
-    matrix.compose(at.set(0, 0, 0), rotation, new Vector3(scale, scale, scale));
-    at.copy(centre).applyMatrix4(matrix).negate().add(centre).addScaledVector(shift, share);
-    return matrix.setPosition(at);
-  };
+  // Where point k of a chunk is drawn (local metres), null where it is not.
+  shownAt(position, info, k) {
+    const u = this.uniforms, own = info[4 * k];
+    if (u.source.value[own].w < 0.5 || (info[4 * k + 2] > 31 && u.showRemoved.value < 0.5)) return null;
+    const m = u.motion.value[own].elements;
+    const a = position[3 * k], b = position[3 * k + 1], c = position[3 * k + 2];
+    const x = m[0] * a + m[4] * b + m[8] * c + m[12];
+    const y = m[1] * a + m[5] * b + m[9] * c + m[13];
+    const z = m[2] * a + m[6] * b + m[10] * c + m[14];
+    const { x: nx, y: ny, z: nz, w: at } = u.slab.value;
+    if (u.slabHalf.value >= 0 && Math.abs(x * nx + y * ny + z * nz - at) > u.slabHalf.value) return null;
+    const half = u.boxHalf.value;
+    if (half.x >= 0) {
+      const halves = [half.x, half.y, half.z];
+      for (let axis = 0; axis < 3; axis++) {
+        const e = u.box.value[axis];
+        if (Math.abs(x * e.x + y * e.y + z * e.z - e.w) > halves[axis]) return null;
+      }
+    }
+    return [x, y, z];
+  }
 }

@@ -1,5 +1,6 @@
 """``dougong view``: clouds of any size in the browser."""
 
+import signal
 import sys
 import threading
 from pathlib import Path
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 def command(
     *paths: Path,
     port: int = 0,
+    pairs: Path | None = None,
     browser: Annotated[bool, Parameter(negative="--no-browser")] = True,
     common: Common = DEFAULT,
 ) -> int:
@@ -31,12 +33,17 @@ def command(
 
     Example: dougong view merged.copc.laz scan.laz
 
+    Example: dougong view scan.laz drone.laz --pairs pairs.csv
+
     Parameters
     ----------
     paths
         Clouds, or the --out folder of a run, a demo or a registration.
     port
         Port of the page; 0: a free one.
+    pairs
+        CSV file for places picked in both of two clouds, for `register --pairs`; what it holds
+        already is shown.
     browser
         Open the browser; else only print the address.
     """
@@ -44,19 +51,29 @@ def command(
 
     def work(progress: Listener) -> Answer:
         viewing = app.view(
-            paths, port=port, open_browser=browser, work=common.work, progress=progress
+            paths,
+            port=port,
+            open_browser=browser,
+            work=common.work,
+            progress=progress,
+            pairs=pairs,
         )
         opened.append(viewing)
         document = viewing.document
         lines = [f"{', '.join(document['clouds'])}: {_text.count(document['points'])} points"]
         if browser and not document["is_browser_open"]:
             lines.append("NO BROWSER COULD BE OPENED here; open this address yourself:")
-        lines += [document["url"], "Ctrl-C ends it."]
+        lines.append(document["url"])
+        if pairs is not None:
+            lines.append(f"Pick pairs > Save writes {pairs}")
+        lines.append("Ctrl-C ends it.")
         return Answer(document=document, text=_text.join(*lines, _text.notes(document["notes"])))
 
     code = execute(common, work)
     try:
         if code == DONE:
+            # Told to end in any way, it leaves no temporary files behind.
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
             sys.stdout.flush()
             threading.Event().wait()
     except KeyboardInterrupt:

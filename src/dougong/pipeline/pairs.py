@@ -3,17 +3,59 @@
 import csv
 import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from dougong.errors import InputError
+from dougong.params import Parameters
+from dougong.pipeline.outputs import write_text
 from dougong.pipeline.provenance import sha256
 from dougong.registration.picked_pairs import PickedPairs
 
 COORDINATES = ("source_x", "source_y", "source_z", "target_x", "target_y", "target_z")
 HEADER = ("name", "cloud", *COORDINATES, "sigma_m", "role")
 """The header of control files: `cloud` is the source, `role` is control (used) or check (not)."""
+
+
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class PickedPair(Parameters):
+    """One place in two clouds, in the coordinates of their files."""
+
+    name: Annotated[str, Field(min_length=1, max_length=80)]
+    source: tuple[_Number, _Number, _Number]
+    target: tuple[_Number, _Number, _Number]
+
+
+class PickedSet(Parameters):
+    """What a page sends that picked pairs."""
+
+    pairs: Annotated[tuple[PickedPair, ...], Field(max_length=10_000)]
+
+
+def write_pairs(path: Path, cloud: str, pairs: Sequence[PickedPair]) -> None:
+    """Write pairs as a control file, to a tenth of a millimetre where units are metres.
+
+    Parameters
+    ----------
+    path : Path
+        Replaced as a whole where it exists.
+    cloud : str
+        Name of the source.
+    pairs : sequence of PickedPair
+    """
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(HEADER)
+    for pair in pairs:
+        places = [f"{value:.4f}" for value in (*pair.source, *pair.target)]
+        rows.writerow([pair.name, cloud, *places, "", "control"])
+    write_text(path, text.getvalue())
 
 
 def read_pairs(path: Path, source: str) -> PickedPairs:

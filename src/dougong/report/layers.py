@@ -22,6 +22,16 @@ COLOURS = ((230, 125, 30), (0, 158, 115), (204, 121, 167), (213, 94, 0), (140, 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Removed:
+    """Points that the filters took out of a cloud, where the cloud is now."""
+
+    after: Points
+    """(k, 3) as `Layer.after`."""
+    reasons: NDArray[np.uint8]
+    """(k,) `dougong.filters.selection.Reason`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Layer:
     """One cloud as it is drawn."""
 
@@ -41,6 +51,7 @@ class Layer:
     """(n, 3) colours or (n, 1) grey of the file."""
     classes: NDArray[np.uint8] | None = None
     """(n,) LAS classes."""
+    removed: Removed | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +63,7 @@ class Thinned:
     origin: Values
     colours: NDArray[np.uint8] | None
     classes: NDArray[np.uint8] | None
+    reasons: NDArray[np.uint8] | None
 
 
 def read_thinned(path: Path, points: int) -> Thinned:
@@ -65,7 +77,7 @@ def read_thinned(path: Path, points: int) -> Thinned:
     """
     stride = max(1, -(-points // MAX_POINTS))
     taken: list[Points] = []
-    looks: list[tuple[NDArray[Any] | None, NDArray[Any] | None]] = []
+    looks: list[tuple[NDArray[Any] | None, ...]] = []
     origin: Values | None = None
     seen = 0
     for chunk in iterate(path):
@@ -73,15 +85,17 @@ def read_thinned(path: Path, points: int) -> Thinned:
             origin = chunk.frame.origin
         chosen = np.arange((-seen) % stride, len(chunk), stride)
         taken.append(chunk.rebased(origin).xyz[chosen])
-        looks.append((_colours(chunk, chosen), _attribute(chunk, chosen, "classification")))
+        codes = [_attribute(chunk, chosen, name) for name in ("classification", "dougong_reason")]
+        looks.append((_colours(chunk, chosen), *codes))
         seen += len(chunk)
     assert origin is not None
-    colours, classes = (_joined([look[index] for look in looks]) for index in (0, 1))
+    colours, classes, reasons = (_joined([look[index] for look in looks]) for index in range(3))
     return Thinned(
         xyz=np.concatenate(taken),
         origin=origin,
         colours=None if colours is None else _as_bytes(colours),
         classes=None if classes is None else classes.astype(np.uint8),
+        reasons=None if reasons is None else reasons.astype(np.uint8),
     )
 
 
@@ -143,14 +157,17 @@ def run_layers(folder: Path, result: dict[str, Any]) -> list[Layer]:
         is_reference = name == result["reference"]
         is_sure = is_reference or name in result["merged"]["clouds"]
         before, after = xyz, xyz + (origin - common)
+        taken = _removed(folder, entry, common)
         matrix = None if is_reference else matrices[name]
         if matrix is not None and is_sure:
             before = _taken_back(xyz, origin, np.array(matrix))
         elif matrix is not None:
             after = _brought(xyz, origin, np.array(matrix), common)
+            taken = None if taken is None else _moved_there(taken, np.array(matrix), common)
         layers.append(
             Layer(
                 name=name,
+                removed=taken,
                 colour=BLUE if is_reference else next(colours),
                 after=after,
                 before=before,
@@ -163,6 +180,22 @@ def run_layers(folder: Path, result: dict[str, Any]) -> list[Layer]:
             )
         )
     return layers[1:] + layers[:1]
+
+
+def _removed(folder: Path, entry: dict[str, Any], common: Values) -> Removed | None:
+    """Return what was taken out of a cloud of a run, about `common`; None where nothing was."""
+    path, count = folder / "removed" / f"{entry['name']}.laz", entry.get("removed_shown", 0)
+    if not count or not path.is_file():
+        return None
+    read = read_thinned(path, count)
+    if read.reasons is None:
+        return None
+    return Removed(after=read.xyz + (read.origin - common), reasons=read.reasons)
+
+
+def _moved_there(removed: Removed, matrix: Transform, common: Values) -> Removed:
+    """Return points that lie in their own coordinates, about `common`, moved by a matrix."""
+    return replace(removed, after=_brought(removed.after, common, matrix, common))
 
 
 def _brought(xyz: Points, origin: Values, matrix: Transform, common: Values) -> Points:

@@ -2,7 +2,8 @@
 
 A cloud is a zlib stream of byte planes in base64, its points in Morton order so that neighbours in
 space are neighbours in the stream: per axis the low and the high byte of the position inside its
-block, then the size, the colour, the distance to the other clouds, the class.
+block, then the size, the colour, the distance to the other clouds, the class, the reason of
+removal.
 About 8 bytes a point.
 """
 
@@ -128,9 +129,12 @@ def distances(points: Points, others: Points) -> Values:
 
 
 def distance_codes(found: Values) -> NDArray[np.uint8]:
-    """Return distances (n,) as bytes: 254 sqrt(d / reach), fine where d is small; 255 for NaN."""
-    share = np.sqrt(np.clip(np.nan_to_num(found) / REACH_M, 0.0, 1.0))
-    codes = np.round(254 * share).astype(np.uint8)
+    """Return signed distances (n,) as bytes: 127 + 127 sign(d) sqrt(|d| / reach); 255 for NaN.
+
+    Fine where d is small: the steps are 0.25 mm at 1 mm and 1.2 mm at 25 mm.
+    """
+    share = np.sqrt(np.clip(np.abs(np.nan_to_num(found)) / REACH_M, 0.0, 1.0))
+    codes = (127 + np.round(127 * np.sign(np.nan_to_num(found)) * share)).astype(np.uint8)
     codes[np.isnan(found)] = NO_CLOUD
     return codes
 
@@ -153,19 +157,33 @@ def back_motion(layer: Layer) -> Transform:
     return matrix
 
 
-def pack(layer: Layer, chosen: NDArray[np.int64], found: Values | None, source: int) -> Packed:
-    """Pack the chosen points of a layer.
+def pack(
+    points: Points,
+    *,
+    source: int,
+    element: str,
+    colours: NDArray[np.uint8] | None = None,
+    found: Values | None = None,
+    classes: NDArray[np.uint8] | None = None,
+    reasons: NDArray[np.uint8] | None = None,
+) -> Packed:
+    """Pack the points (n, 3) of a cloud, metres, with what is known of each.
 
     Parameters
     ----------
-    layer : Layer
-    chosen : ndarray, shape (k,)
-    found : ndarray, shape (k,), optional
-        Distances to the other clouds, metres.
+    points : ndarray, shape (n, 3)
     source : int
-        Which cloud it is.
+        Which cloud of the scene they belong to.
+    element : str
+        The id of the page's element that holds them.
+    colours : ndarray, shape (n, 3) or (n, 1), optional
+        Colours, or grey.
+    found : ndarray, shape (n,), optional
+        Signed distances to the other clouds, metres.
+    classes, reasons : ndarray, shape (n,), optional
+        LAS classes; `dougong.filters.selection.Reason` of removal.
     """
-    lattice = np.round(layer.after[chosen] / STEP_M).astype(np.int64)
+    lattice = np.round(points / STEP_M).astype(np.int64)
     block, inside = lattice // _BLOCK, lattice % _BLOCK
     order = np.lexsort((_morton(inside), block[:, 2], block[:, 1], block[:, 0]))
     block, inside = block[order], inside[order]
@@ -174,27 +192,27 @@ def pack(layer: Layer, chosen: NDArray[np.int64], found: Values | None, source: 
     planes: list[NDArray[Any]] = [
         part for axis in range(3) for part in (inside[:, axis] & 255, inside[:, axis] >> 8)
     ]
-    planes.append(size_codes(sizes(layer.after[chosen]))[order])
+    planes.append(size_codes(sizes(points))[order])
     kind = "none"
-    if layer.colours is not None:
-        kind = "rgb" if layer.colours.shape[1] == 3 else "intensity"
-        planes += list(layer.colours[chosen][order].T)
+    if colours is not None:
+        kind = "rgb" if colours.shape[1] == 3 else "intensity"
+        planes += list(colours[order].T)
     if found is not None:
         planes.append(distance_codes(found)[order])
-    if layer.classes is not None:
-        planes.append(layer.classes[chosen][order])
+    planes += [values[order] for values in (classes, reasons) if values is not None]
     raw = b"".join(np.ascontiguousarray(plane, dtype=np.uint8).tobytes() for plane in planes)
     return Packed(
         head={
             "source": source,
-            "points": len(chosen),
+            "points": len(points),
             "step_m": STEP_M,
             "spacing_m": SMALLEST_M,
             "blocks": np.column_stack([block[starts], counts]).tolist(),
             "colour": kind,
             "has_residual": found is not None,
-            "has_class": layer.classes is not None,
-            "element": f"viewer-points-{source}",
+            "has_class": classes is not None,
+            "has_reason": reasons is not None,
+            "element": element,
         },
         data=base64.b64encode(zlib.compress(raw, 8)).decode("ascii"),
     )

@@ -1,16 +1,20 @@
 """Clouds of any size in the browser: a server for this computer alone that answers byte ranges."""
 
 import http.server
+import json
 import re
 import secrets
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+from dougong.errors import DougongError
 
 HOST = "127.0.0.1"
 _PIECE = 1 << 18
+_MOST_SENT = 1 << 20
 # The decoder is compiled in the page, which its loader does with code made at run time.
 _POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-eval'; style-src 'unsafe-inline'; "
@@ -26,6 +30,10 @@ class Served:
     body: bytes | Path
 
 
+Take = Callable[[Any], dict[str, Any]]
+"""Takes a JSON document that the page sends; returns what to answer."""
+
+
 class _Handler(http.server.BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server: "_Server"
@@ -37,6 +45,30 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def do_HEAD(self) -> None:
         """Answer with the headers alone."""
         self._answer(with_body=False)
+
+    def do_POST(self) -> None:
+        """Take a JSON document from our own page, and from no other."""
+        self.close_connection = True  # what is refused is not read either
+        take = self.server.takes.get(self.path.partition("?")[0])
+        host, origin = self.headers.get("Host"), self.headers.get("Origin")
+        length = self.headers.get("Content-Length", "")
+        if host not in self.server.hosts or origin != f"http://{host}":
+            self._refuse(403)
+        elif take is None:
+            self._refuse(404)
+        elif self.headers.get_content_type() != "application/json":
+            self._refuse(415)
+        elif not length.isdigit() or int(length) > _MOST_SENT:
+            self._refuse(413)
+        else:
+            try:
+                said = take(json.loads(self.rfile.read(int(length))))
+                code = 200
+            except (DougongError, ValueError) as error:
+                said, code = {"error": " ".join(str(error).split())}, 400
+            body = json.dumps(said).encode()
+            self._head(code, "application/json", len(body))
+            self.wfile.write(body)
 
     def _answer(self, *, with_body: bool) -> None:
         # A page from elsewhere that points its own name at this computer has the wrong host.
@@ -66,6 +98,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             extra.append(("Content-Range", f"bytes {first}-{last}/{size}"))
         self._head(200 if asked is None else 206, kind, last - first + 1, *extra)
         if with_body:
+            self.server.count(last - first + 1)
             with path.open("rb") as file:
                 file.seek(first)
                 self._send(file, last - first + 1)
@@ -118,7 +151,14 @@ def byte_range(text: str, size: int) -> tuple[int, int] | None:
 class _Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
     things: Mapping[str, Served]
+    takes: Mapping[str, Take]
     hosts: frozenset[str]
+    sent: int
+    lock: threading.Lock
+
+    def count(self, sent: int) -> None:
+        with self.lock:
+            self.sent += sent
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Say nothing: a browser that closes a connection early is no error."""
@@ -131,15 +171,25 @@ class ViewServer:
     of this computer cannot read the clouds.
     """
 
-    def __init__(self, things: Mapping[str, Served], port: int = 0) -> None:
+    def __init__(
+        self, things: Mapping[str, Served], port: int = 0, takes: Mapping[str, Take] | None = None
+    ) -> None:
         token = secrets.token_urlsafe(12)
         self._server = _Server((HOST, port), _Handler)
         port = self._server.server_address[1]
         self._server.things = {f"/{token}/{name}": served for name, served in things.items()}
+        self._server.takes = {f"/{token}/{name}": take for name, take in (takes or {}).items()}
+        self._server.sent, self._server.lock = 0, threading.Lock()
         self._server.hosts = frozenset({f"{HOST}:{port}", f"localhost:{port}"})
         self.url = f"http://{HOST}:{port}/{token}/"
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        # Looks ten times a second whether it is to end.
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
         self._thread.start()
+
+    @property
+    def bytes_sent(self) -> int:
+        """Bytes of the clouds' files that were asked for so far."""
+        return self._server.sent
 
     def close(self) -> None:
         """Stop answering."""

@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 
 from dougong.errors import InputError
-from dougong.formats import FileInfo, describe, iterate, read, write
+from dougong.formats import FileInfo, describe, read, write
 from dougong.report.layers import BLUE, COLOURS
+from dougong.report.looks import SIGNED_TITLE, SIGNED_WORDS, Look, look_at
+from dougong.report.payload import REACH_M
+from dougong.report.picking import picking
 from dougong.report.render import environment
-from dougong.report.server import Served
+from dougong.report.server import Served, Take
 from dougong.report.viewer import STATIC, why_missing
 from dougong.typing import Transform, Values
 
 _FAR_M = 20_000.0
-_SAMPLE = 100_000
-_UNCLASSIFIED = {0, 1}
 
 Note = Callable[[str], None]
 
@@ -36,6 +37,8 @@ class Item:
     reference: str | None = None
     turns: dict[str, Transform] = field(default_factory=dict)
     """For a cloud that was registered: the matrix that did it."""
+    removed_of: str | None = None
+    """The file holds what was taken out of this source of the item before."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,6 +49,8 @@ class Scene:
     clouds: tuple[str, ...]
     points: int
     notes: tuple[str, ...]
+    takes: dict[str, Take] = field(default_factory=dict)
+    """What the page may send."""
 
 
 def items_of(paths: Sequence[Path]) -> tuple[list[Item], list[str]]:
@@ -66,7 +71,7 @@ def items_of(paths: Sequence[Path]) -> tuple[list[Item], list[str]]:
         if path.is_file():
             items.append(Item(name=path.name, path=path))
         elif (path / "result.json").is_file():
-            items.append(_merged(path, notes))
+            items += _merged(path, notes)
         elif (path / "registration.json").is_file():
             items += _pair(path)
         else:
@@ -83,8 +88,8 @@ def _load(path: Path) -> dict[str, Any]:
     return document
 
 
-def _merged(folder: Path, notes: list[str]) -> Item:
-    """Return the merged cloud of a run."""
+def _merged(folder: Path, notes: list[str]) -> list[Item]:
+    """Return the merged cloud of a run, then what was taken out of its clouds."""
     result = _load(folder / "result.json")
     merged = result["merged"]
     left = [cloud["name"] for cloud in result["clouds"] if cloud["name"] not in merged["clouds"]]
@@ -92,13 +97,19 @@ def _merged(folder: Path, notes: list[str]) -> Item:
         notes.append(f"{', '.join(left)}: not merged (no sure pose), so not shown")
     ids = merged.get("source_ids") or {}
     matrices = {entry["source"]: entry["matrix"] for entry in result["registrations"]}
-    return Item(
+    whole = Item(
         name=result["project"],
         path=folder / merged["file"],
         sources=tuple((name, int(ids[name])) for name in merged["clouds"] if name in ids),
         reference=result["reference"],
         turns={name: np.array(matrix) for name, matrix in matrices.items() if matrix is not None},
     )
+    removed = [(name, folder / "removed" / f"{name}.laz") for name in merged["clouds"]]
+    return [whole] + [
+        Item(name=f"removed from {name}", path=path, removed_of=name)
+        for name, path in removed
+        if path.is_file()
+    ]
 
 
 def _pair(folder: Path) -> list[Item]:
@@ -120,7 +131,7 @@ def _pair(folder: Path) -> list[Item]:
     return [moved, Item(name=document["target"], path=target, reference=document["target"])]
 
 
-def prepare(paths: Sequence[Path], scratch: Path, say: Note) -> Scene:
+def prepare(paths: Sequence[Path], scratch: Path, say: Note, pairs: Path | None = None) -> Scene:
     """Return the page for some clouds; those that are no COPC files are converted into `scratch`.
 
     Parameters
@@ -130,11 +141,13 @@ def prepare(paths: Sequence[Path], scratch: Path, say: Note) -> Scene:
         A folder for temporary files; needs about as much room as the clouds have as LAZ.
     say : callable
         Told what takes time.
+    pairs : Path, optional
+        The CSV file that pairs picked in two clouds go to; what it holds already is shown.
 
     Raises
     ------
     InputError
-        See `items_of`; or this installation has no viewer.
+        See `items_of`; or this installation has no viewer; or pairs cannot be picked here.
     FormatError
         A file cannot be read.
     """
@@ -142,16 +155,25 @@ def prepare(paths: Sequence[Path], scratch: Path, say: Note) -> Scene:
     if missing is not None:
         raise InputError(f"there is nothing to view with: {missing}.")
     items, notes = items_of(paths)
-    paths = [_streamable(item.path, scratch, index, say, notes) for index, item in enumerate(items)]
+    picked, takes = _picking(items, pairs)
+    files = [_streamable(item, scratch, index, say, notes) for index, item in enumerate(items)]
     sources: list[dict[str, Any]] = []
     clouds: list[dict[str, Any]] = []
-    colours = {"source", "height"}
-    origin, placed = _placed(items, paths, notes)
-    for index, (item, path) in enumerate(zip(items, paths, strict=True)):
-        look = _look(path)
-        colours |= look.pop("colours")
+    looks: list[Look] = []
+    origin, placed = _placed(items, files, notes)
+    for index, (item, path) in enumerate(zip(items, files, strict=True)):
+        look = look_at(path)
+        looks.append(look)
         first = len(sources)
-        sources += _sources(item, first)
+        if item.removed_of is None:
+            added = _sources(item, first)
+            # Where a cloud is shown far from its own place, its coordinates are still its own.
+            shift = _origin_of(placed[index], item, path)
+            sources += [{**source, "origin": shift.tolist()} for source in added]
+            ids = {code: first + n for n, (_, code) in enumerate(item.sources)} or None
+        else:
+            named = [source["name"] for source in sources]
+            first, ids = named.index(item.removed_of), None
         clouds.append(
             {
                 "name": item.name,
@@ -159,15 +181,37 @@ def prepare(paths: Sequence[Path], scratch: Path, say: Note) -> Scene:
                 "points": describe(path).points,
                 "to_local": placed[index].ravel().tolist(),
                 "source": first,
-                "source_ids": {code: first + n for n, (_, code) in enumerate(item.sources)} or None,
-                **look,
+                "source_ids": ids,
+                "grey": look.grey,
+                "colour_bits": look.colour_bits,
+                "residual": look.residual,
+                "code_max_m": REACH_M,
             }
         )
     things = {
         cloud["url"]: Served(kind="application/octet-stream", body=path.resolve())
-        for cloud, path in zip(clouds, paths, strict=True)
+        for cloud, path in zip(clouds, files, strict=True)
     }
-    scene = {
+    scene = _scene(sources, clouds, looks, origin)
+    scene["pairs"] = picked
+    return Scene(
+        things=things | _page(", ".join(item.name for item in items[:3]), scene),
+        clouds=tuple(source["name"] for source in sources),
+        points=sum(cloud["points"] for cloud in clouds),
+        notes=tuple(notes),
+        takes=takes,
+    )
+
+
+def _scene(
+    sources: list[dict[str, Any]],
+    clouds: list[dict[str, Any]],
+    looks: list[Look],
+    origin: Values,
+) -> dict[str, Any]:
+    colours = {"source", "height"}.union(*(look.colours for look in looks))
+    spread = [look.residual_shown_m for look in looks if look.residual is not None]
+    return {
         "sources": sources,
         "clouds": clouds,
         "origin": origin.tolist(),
@@ -175,13 +219,32 @@ def prepare(paths: Sequence[Path], scratch: Path, say: Note) -> Scene:
         "colours": _order(colours, len(sources)),
         "natural": "colours of the files; grey is intensity",
         "precision_m": None,
+        "reasons": sorted({0}.union(*(look.reasons for look in looks))),
+        "residual": {
+            "shown_m": max(spread, default=0.05),
+            "reach_m": None,
+            "code_max_m": REACH_M,
+            "is_signed": True,
+            "title": SIGNED_TITLE,
+            "signs": SIGNED_WORDS,
+        },
     }
-    return Scene(
-        things=things | _page(", ".join(item.name for item in items), scene),
-        clouds=tuple(source["name"] for source in sources),
-        points=sum(cloud["points"] for cloud in clouds),
-        notes=tuple(notes),
+
+
+def _picking(
+    items: list[Item], pairs: Path | None
+) -> tuple[dict[str, Any] | None, dict[str, Take]]:
+    """Return what the page must know to pick pairs (None: it cannot), and what it may send."""
+    own = [item.path for item in items if not item.sources and item.removed_of is None]
+    if len(own) == len(items) == 2:
+        return picking(own[0], own[1], pairs)
+    if pairs is None:
+        return None, {}
+    msg = (
+        f"--pairs needs two clouds to pick in, the source and the target, got {len(own)}. "
+        "Name two clouds, or the folder of a registration."
     )
+    raise InputError(msg)
 
 
 def _placed(
@@ -201,7 +264,7 @@ def _placed(
             shift = np.floor(middle)
             notes.append(
                 f"{item.name} lies {away / 1000:.0f} km from {items[0].name}: both are shown about "
-                "one middle, and the coordinates read from it are not its own"
+                "one middle; coordinates that are read from either are its own"
             )
         matrix[:3, 3] -= shift
         placed.append(matrix)
@@ -209,11 +272,18 @@ def _placed(
     return origin, placed
 
 
+def _origin_of(placed: Transform, item: Item, path: Path) -> Values:
+    """Return what must be added to metres as shown to get those of the frame that is shown."""
+    unit = np.array(describe(path).unit_m)
+    origin: Values = unit * item.T_shown_file[:3, 3] - placed[:3, 3]
+    return origin
+
+
 def _order(colours: set[str], sources: int) -> list[str]:
     """Return the colourings on offer, the first one first."""
-    order = ["source", "height", "natural", "class"]
+    order = ["source", "height", "natural", "residual", "class", "reason"]
     if sources == 1:
-        order = ["natural", "height", "class", "source"]
+        order = ["natural", "height", "residual", "class", "reason", "source"]
     return [name for name in order if name in colours]
 
 
@@ -236,14 +306,17 @@ def _middle(info: FileInfo) -> Values:
     return middle
 
 
-def _streamable(path: Path, scratch: Path, index: int, say: Note, notes: list[str]) -> Path:
+def _streamable(item: Item, scratch: Path, index: int, say: Note, notes: list[str]) -> Path:
     """Return the path of a COPC file with these points."""
+    path = item.path
     info = describe(path)
     if info.format == "COPC":
         return path
     say(f"converting {path.name} ({info.format}, {info.points:,} points) to COPC")
     converted = scratch / f"{index}.copc.laz"
     written = write(read(path), converted)
+    if item.removed_of is not None:
+        return converted
     notes.append(
         f"{path.name} is {info.format}, which cannot be streamed: a temporary COPC copy is shown "
         f"({written.bytes / 1e6:.1f} MB, removed at the end)"
@@ -274,22 +347,3 @@ def _sources(item: Item, first: int) -> list[dict[str, Any]]:
             }
         )
     return listed
-
-
-def _look(path: Path) -> dict[str, Any]:
-    """Return how a COPC file is coloured, by its first points (its coarsest level)."""
-    sample = next(iter(iterate(path, _SAMPLE)))
-    colours = set()
-    grey = [0.0, 65535.0]
-    intensity = sample.attribute("intensity")
-    if intensity is not None and intensity.any():
-        grey = [float(value) for value in np.percentile(intensity, [1, 99])]
-        colours.add("natural")
-    channels = [sample.attribute(name) for name in ("red", "green", "blue")]
-    peak = max((int(channel.max()) for channel in channels if channel is not None), default=0)
-    if peak:
-        colours.add("natural")
-    classes = sample.attribute("classification")
-    if classes is not None and set(np.unique(classes).tolist()) - _UNCLASSIFIED:
-        colours.add("class")
-    return {"grey": grey, "colour_bits": 16 if peak > 255 else 8, "colours": colours}

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from dougong.report.figures import Place
-from dougong.report.layers import Layer
+from dougong.report.layers import Layer, Removed
+from dougong.report.looks import scale_end
 from dougong.report.payload import (
     MAX_POINTS,
     REACH_M,
@@ -20,12 +21,13 @@ from dougong.report.payload import (
     shares,
     thinned,
 )
-from dougong.report.plates import round_length
 
 STATIC = Path(__file__).parent / "static"
 _EYE_M = 1.5
 """Height of the first level slice: through walls and posts, not through the roof."""
 _LINE = 6000
+_REMOVED_SHARE = 0.15
+"""Share of the page's points that removed ones may take."""
 NOT_BUILT = (
     "this copy of dougong was never built with its viewer; install it with pip, with the npm "
     "registry in reach"
@@ -64,21 +66,44 @@ def view_3d(layers: list[Layer], place: Place, static: Path = STATIC) -> View3D:
         Where the built viewer is.
     """
     shown = [layer for layer in layers if layer.is_placed and len(layer.after)]
-    allowed = shares([len(layer.after) for layer in shown], MAX_POINTS)
+    counts = [0 if layer.removed is None else len(layer.removed.after) for layer in shown]
+    taken = shares(counts, round(_REMOVED_SHARE * MAX_POINTS))
+    allowed = shares([len(layer.after) for layer in shown], MAX_POINTS - sum(taken))
     packed, found_all = [], []
-    for index, (layer, most) in enumerate(zip(shown, allowed, strict=True)):
+    for index, (layer, most, out) in enumerate(zip(shown, allowed, taken, strict=True)):
         chosen = thinned(layer.after, most)
         others = [other.after for other in shown if other is not layer]
         found = distances(layer.after[chosen], np.concatenate(others)) if others else None
         if found is not None:
             found_all.append(found[~np.isnan(found)])
-        packed.append(pack(layer, chosen, found, index))
+        packed.append(
+            pack(
+                layer.after[chosen],
+                source=index,
+                element=f"viewer-points-{index}",
+                colours=None if layer.colours is None else layer.colours[chosen],
+                found=found,
+                classes=None if layer.classes is None else layer.classes[chosen],
+            )
+        )
+        if layer.removed is not None and out:
+            packed.append(_packed_removed(layer.removed, out, index))
     return View3D(
         scene=_scene(shown, place, packed, found_all),
         clouds=tuple(packed),
         script=(static / "report.js").read_text(encoding="utf-8"),
         style=(static / "viewer.css").read_text(encoding="utf-8"),
         lead=_lead(shown, packed),
+    )
+
+
+def _packed_removed(removed: Removed, most: int, index: int) -> Packed:
+    chosen = thinned(removed.after, most)
+    return pack(
+        removed.after[chosen],
+        source=index,
+        element=f"viewer-removed-{index}",
+        reasons=removed.reasons[chosen],
     )
 
 
@@ -92,6 +117,9 @@ def _scene(
     colours += ["natural"] if any(layer.colours is not None for layer in shown) else []
     colours += ["residual"] if len(near) else []
     colours += ["class"] if set(present) - {0, 1} else []
+    taken = [np.unique(layer.removed.reasons) for layer in shown if layer.removed is not None]
+    reasons = sorted({0, *(int(code) for codes in taken for code in codes)})
+    colours += ["reason"] if taken else []
     if len(shown) == 1:
         colours = [*colours[1:], "source"]
     level = min(0.5, _EYE_M / (place.top - place.floor))
@@ -113,7 +141,14 @@ def _scene(
         "natural": _natural(shown),
         "classes": present,
         "precision_m": STEP_M / 2,
-        "residual": {"shown_m": _shown(near), "reach_m": REACH_M, "code_max_m": REACH_M},
+        "reasons": reasons,
+        "residual": {
+            "shown_m": scale_end(near),
+            "reach_m": REACH_M,
+            "code_max_m": REACH_M,
+            "is_signed": False,
+            "title": "distance to the other cloud",
+        },
     }
 
 
@@ -128,14 +163,6 @@ def _thickness(shown: list[Layer], place: Place, height: float) -> float:
         if share * float((off <= thickness / 2).sum()) >= _LINE:
             return thickness
     return 0.5
-
-
-def _shown(near: Any) -> float:
-    """Return the end of the distance scale: a round length above nine tenths of the distances."""
-    if not len(near):
-        return 0.05
-    ninth = float(np.clip(np.percentile(near, 90), 0.004, REACH_M / 2))
-    return min(round_length(2.2 * ninth), REACH_M)
 
 
 def _source(layer: Layer, place: Place) -> dict[str, Any]:
@@ -173,7 +200,7 @@ def _natural(shown: list[Layer]) -> str:
 
 
 def _lead(shown: list[Layer], packed: list[Packed]) -> str:
-    count = sum(cloud.head["points"] for cloud in packed)
+    count = sum(cloud.head["points"] for cloud in packed if not cloud.head["has_reason"])
     text = (
         f"{count:,} points, evenly thinned for this page; positions rounded to "
         f"{STEP_M * 1000:g} mm (off by {STEP_M * 500:g} mm at most along each axis). "
@@ -184,6 +211,12 @@ def _lead(shown: list[Layer], packed: list[Packed]) -> str:
         )
     if len(shown) > 1:
         text += (
-            "Distance: from a point to the plane through the 8 nearest points of the other clouds."
+            "Distance: from a point to the plane through the 8 nearest points of the other clouds. "
         )
-    return text
+    out = sum(cloud.head["points"] for cloud in packed if cloud.head["has_reason"])
+    if out:
+        text += (
+            f"Removed: {out:,} points that the filters took out, each coloured by its reason; they "
+            "are no part of the result. Decimated points are not among them."
+        )
+    return text.rstrip()
