@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dougong.formats.units import parse_crs, units_of
+from dougong.formats.units import is_same_crs, parse_crs, units_of
 
 _STEP_M = 100.0
 """Half the length that is measured on the ellipsoid and on the map, per axis."""
@@ -155,6 +155,14 @@ def is_in_use(wkt: str | None, x: float, y: float) -> bool:
         (-_MARGIN_DEG <= east <= width + _MARGIN_DEG or width > 358.0)
         and area.south - _MARGIN_DEG <= latitude <= area.north + _MARGIN_DEG
     )
+
+
+def is_same_plan(one: str, other: str) -> bool:
+    """Say whether two systems have one map, whatever their heights are counted from."""
+    plans = _projection(one), _projection(other)
+    if plans[0] is None or plans[1] is None:
+        return False
+    return is_same_crs(plans[0].to_wkt(), plans[1].to_wkt())
 
 
 def axes_swapped(wkt: str | None, x: float, y: float) -> bool:

@@ -81,15 +81,48 @@ def _registered(crs: Any) -> Any:
         found = CRS.from_user_input("EPSG:" + "+".join(map(str, codes)))
     except CRSError:
         return None
-    return found if found.equals(crs, ignore_axis_order=True) else None
+    return found if _means_the_same(found, crs) else None
 
 
+def _means_the_same(one: Any, other: Any) -> bool:
+    """Say whether two systems are one, whatever the order they name easting and northing in.
+
+    Point clouds hold the easting first in any case, and WKT 1 as LAS holds it names no order.
+    """
+    if one.equals(other, ignore_axis_order=True):
+        return True
+    return bool(_easting_first(one).equals(_easting_first(other), ignore_axis_order=True))
+
+
+def _easting_first(crs: Any) -> Any:
+    """Return a system whose projected part names its easting, then its northing."""
+    from pyproj import CRS
+
+    document = crs.to_json_dict()
+    for part in document.get("components", [document]):
+        inner = part.get("source_crs", part)
+        if inner.get("type") != "ProjectedCRS":
+            continue
+        axes = inner["coordinate_system"]["axis"]
+        by_way = {axis["direction"]: axis for axis in axes}
+        if not {"east", "north"} <= set(by_way):
+            continue
+        named = (("east", "Easting", "E"), ("north", "Northing", "N"))
+        plan = [{**by_way[way], "name": name, "abbreviation": short} for way, name, short in named]
+        inner["coordinate_system"]["axis"] = plan + axes[2:]
+        part.pop("id", None)
+        inner.pop("id", None)
+    document.pop("id", None)
+    return CRS.from_json_dict(document)
+
+
+@lru_cache(maxsize=256)
 def is_same_crs(first: str | None, second: str | None) -> bool:
     """Say whether two WKT texts mean the same reference system; two None do."""
     if first == second or first is None or second is None:
         return first == second
     one, other = parse_crs(first), parse_crs(second)
-    return one is not None and other is not None and one.equals(other, ignore_axis_order=True)
+    return one is not None and other is not None and _means_the_same(one, other)
 
 
 @lru_cache(maxsize=64)
@@ -223,6 +256,8 @@ def metre_form(wkt: str) -> str:
             part.pop("id", None)
             part["name"] += " (in metres)"
     document.pop("id", None)
+    if "components" in document:
+        document["name"] += " (in metres)"
     return str(CRS.from_json_dict(document).to_wkt())
 
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from dougong.cloud import Cloud
 from dougong.errors import InputError
-from dougong.formats import is_same_crs, units_of
-from dougong.formats.projection import GridScale, grid_scale, is_in_use
+from dougong.formats import units_of
+from dougong.formats.projection import GridScale, grid_scale, is_in_use, is_same_plan
 from dougong.registration.picked_pairs import PickedPairs
 from dougong.registration.result import FineResult, Hypothesis, Registration
 from dougong.typing import Points, Transform, Values
@@ -150,7 +150,9 @@ def _scale_of(cloud: Cloud) -> GridScale | None:
 def _is_one_map(source: Cloud, target: Cloud, one: GridScale | None, two: GridScale | None) -> bool:
     """Say whether both clouds are on the same map: then no factor stands between them."""
     if one is not None and two is not None:
-        return is_same_crs(source.frame.crs, target.frame.crs) or one.system == two.system
+        return one.system == two.system or is_same_plan(
+            source.frame.crs or "", target.frame.crs or ""
+        )
     plain, projected = (source, target) if one is None else (target, source)
     return plain.frame.crs is None and _overlap_in_plan(plain, projected)
 

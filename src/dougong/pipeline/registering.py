@@ -8,13 +8,18 @@ from dougong.cloud import Cloud
 from dougong.errors import FrameError
 from dougong.formats import is_same_crs, require_metric, units_of
 from dougong.formats.faults import coordinate_hashes
-from dougong.formats.projection import projection_problem
+from dougong.formats.projection import is_same_plan, projection_problem
+from dougong.pipeline.axes import mirrored_axes, upside_down
 from dougong.pipeline.ground import pair_on_ground, to_file
 from dougong.registration import Register
 from dougong.registration import register as search
 from dougong.registration.picked_pairs import PickedPairs
 from dougong.registration.result import Registration
 from dougong.typing import Kind
+
+_SAME_PLAN_M = 10.0
+_LEAST_M = 2.0
+_GEOID_M = 115.0
 
 
 def register(
@@ -60,6 +65,9 @@ def register(
     for cloud in (source, target):
         require_metric(cloud)
         require_registrable(cloud)
+    mirrored = mirrored_axes(source, target)
+    if mirrored is not None:
+        raise FrameError(mirrored)
     params = params or Register()
     one, two = without_copies(source), without_copies(target)
     pair, notes = pair_on_ground(one, two, params.grid_scale)
@@ -67,9 +75,34 @@ def register(
         one, two = pair.source.cloud, pair.target.cloud
         pairs = None if pairs is None else pair.picked(pairs)
     result = search(one, two, params, source_kind=source_kind, target_kind=target_kind, pairs=pairs)
+    if result.status == "failed" and params.coarse in ("auto", "plan"):
+        turned = upside_down(one, two, result, params, source_kind, target_kind)
+        result = result if turned is None else replace(result, reason=turned)
     if pair is not None:
         result = to_file(result, pair, source, target)
+    notes = (*notes, *height_note(result, source, target))
     return replace(result, notes=(*different_systems(source, target), *notes, *result.notes))
+
+
+def height_note(result: Registration, source: Cloud, target: Cloud) -> tuple[str, ...]:
+    """Return what is to be said where two clouds of one map lie at other heights only.
+
+    Heights above the ellipsoid and above a geoid differ by up to 110 m, and nothing else does.
+    """
+    one, other = source.frame.crs, target.frame.crs
+    is_one_map = one is not None and other is not None and is_same_plan(one, other)
+    if result.matrix is None or not is_one_map:
+        return ()
+    middle = source.frame.to_file(np.median(source.xyz, axis=0)[None])[0]
+    linear = result.matrix[:3, :3]
+    shift = (linear @ middle + result.matrix[:3, 3] - middle) * np.asarray(target.frame.unit_m)
+    if np.linalg.norm(shift[:2]) > _SAME_PLAN_M or not _LEAST_M < abs(shift[2]) < _GEOID_M:
+        return ()
+    return (
+        f"{source.name} and {target.name} agree in plan, and {target.name} lies {shift[2]:+.2f} m "
+        "higher: as heights above the ellipsoid and above a geoid differ. The matrix takes it "
+        "up; name the vertical system of both where heights are to be handed over",
+    )
 
 
 def require_registrable(cloud: Cloud) -> None:

@@ -1,0 +1,151 @@
+"""Reference systems through every writer, and axes that were swapped or turned round."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pyproj import CRS
+
+import dougong
+from dougong.cloud import Cloud, Frame
+from dougong.errors import FrameError
+from dougong.formats.check import check
+from dougong.formats.units import as_wkt, is_same_crs, las_wkt, units_of
+from dougong.pipeline import registering
+from dougong.pipeline.axes import mirrored_axes, upside_down
+from dougong.registration import Register
+from dougong.registration.plan_search import PlanSearch
+from dougong.registration.result import Registration
+from registration_sites import SETTINGS, site
+
+PLACE = np.array([500_000.0, 4_000_000.0, 30.0])
+SYSTEMS = {
+    "UTM": CRS.from_epsg(32650),
+    "axes northing, easting": CRS.from_epsg(4549),
+    "compound": CRS.from_user_input("EPSG:32650+5773"),
+    "compound, heights in feet": CRS.from_user_input("EPSG:6346+6360"),
+    "all in feet": CRS.from_user_input("EPSG:2225+6360"),
+    "three-dimensional map": CRS.from_epsg(32650).to_3d(),
+    "no code": CRS.from_proj4(
+        "+proj=tmerc +lon_0=118.3 +k=1 +x_0=500000 +y_0=-3000000 +ellps=GRS80 +units=m +type=crs"
+    ),
+    "with a datum shift": CRS.from_proj4(
+        "+proj=utm +zone=50 +ellps=krass +towgs84=20,-150,-80 +units=m +type=crs"
+    ),
+    "site grid": CRS.from_wkt(
+        'ENGCRS["site",EDATUM["site"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],'
+        'AXIS["z",up],LENGTHUNIT["metre",1]]'
+    ),
+}
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz", ".copc.laz", ".ply", ".e57"])
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_system_survives_every_writer(tmp_path, suffix, name):
+    wkt = SYSTEMS[name].to_wkt()
+    unit = units_of(wkt).unit_m
+    points = PLACE + np.random.default_rng(0).uniform(0, 20, (50, 3))
+    cloud = Cloud.from_points(points)
+    frame = Frame(origin=np.floor(points.min(0) * unit), crs=wkt, unit_m=unit)
+    cloud = replace(cloud, xyz=points * unit - frame.origin, frame=frame)
+    dougong.write(cloud, tmp_path / f"a{suffix}")
+    again = dougong.read(tmp_path / f"a{suffix}")
+    metres = again.xyz + again.frame.origin
+    by_x = [values[values[:, 0].argsort()] for values in (metres, points * unit)]
+    np.testing.assert_allclose(*by_x, atol=1e-4)  # COPC has an order of its own
+    if suffix == ".e57" and unit != (1.0, 1.0, 1.0):
+        # E57 is in metres by definition: the same map, its axes in metres.
+        assert again.frame.unit_m == (1.0, 1.0, 1.0)
+        assert "in metres" in units_of(again.frame.crs).name
+        return
+    assert is_same_crs(again.frame.crs, wkt)
+    assert again.frame.unit_m == pytest.approx(unit, rel=1e-12)
+
+
+@pytest.mark.parametrize("code", ["EPSG:4549", "EPSG:31467", "EPSG:4549+5737", "EPSG:2053"])
+def test_the_order_of_named_axes_makes_no_other_system(code):
+    wkt = CRS.from_user_input(code).to_wkt()
+    assert is_same_crs(wkt, las_wkt(wkt))
+    assert as_wkt(las_wkt(wkt)) == as_wkt(wkt)
+    assert not is_same_crs(wkt, CRS.from_epsg(4548).to_wkt())
+
+
+def on_map(name, matrix=None, crs=None, seed=0):
+    points = PLACE + np.random.default_rng(seed).uniform(0, 30, (300, 3))
+    return Cloud.from_points(points if matrix is None else points @ np.array(matrix), name=name,
+                             crs=crs)  # fmt: skip
+
+
+SWAPPED = [[0, 1, 0], [1, 0, 0], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("matrix", "said"),
+    [
+        (SWAPPED, "x and y are swapped"),
+        (np.diag([-1, 1, 1]), "x is negated"),
+        (np.diag([1, -1, 1]), "y is negated"),
+    ],
+)
+def test_the_wrong_axis_is_named_between_clouds_of_one_map(matrix, said):
+    wrong, right = on_map("scan", matrix, seed=1), on_map("drone", crs="EPSG:32650")
+    for pair in ((wrong, right), (right, wrong)):
+        text = mirrored_axes(*pair)
+        assert text.startswith(f"scan is a mirror image of the site: {said}")
+        with pytest.raises(FrameError, match=said):
+            registering.register(*pair)
+
+
+def test_right_axes_and_scanner_frames_are_left_alone():
+    assert mirrored_axes(on_map("scan", seed=1), on_map("drone")) is None
+    scan = Cloud.from_points(np.random.default_rng(2).uniform(-9, 9, (99, 3)))
+    assert mirrored_axes(scan, on_map("drone")) is None
+
+
+def test_check_names_swapped_axes(tmp_path):
+    dougong.write(on_map("a", SWAPPED, "EPSG:32650"), tmp_path / "swapped.laz")
+    worst = check(tmp_path / "swapped.laz")[0]
+    assert worst.severity == "error"
+    assert "x = 4000015 is a northing" in worst.text
+
+
+@pytest.mark.parametrize(
+    ("flip", "said"), [((1, 1, -1), "negate z"), ((1, -1, -1), "Turn it by 180 deg")]
+)
+def test_a_cloud_with_z_down_is_told_from_one_on_its_head(flip, said):
+    scan, drone = (
+        Cloud.from_points(site(kind, seed), name=kind)
+        for seed, kind in enumerate(("lidar", "photogrammetry"))
+    )
+    params = Register(prepare=SETTINGS, plan=PlanSearch(peaks=24), filtered=True)
+    wrong = replace(scan, xyz=scan.xyz * np.array(flip, dtype=float))
+    text = upside_down(wrong, drone, nothing(), params, "lidar", "photogrammetry")
+    assert text.startswith("lidar fits only with its z turned round")
+    assert said in text
+    assert upside_down(scan, drone, nothing(), params, "lidar", "photogrammetry") is None
+
+
+def nothing(matrix=None):
+    return Registration(
+        status="failed" if matrix is None else "ok", matrix=matrix, reason="", probability=0.0,
+        scale=1.0, dof=6, coarse_method="plan", hypotheses=(), margin=0.0, fine=None,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("systems", "rise", "is_said"),
+    [
+        (("EPSG:32650", "EPSG:32650+5773"), 45.0, True),
+        (("EPSG:32650", "EPSG:32650"), -28.4, True),
+        (("EPSG:32650", "EPSG:32650"), 0.3, False),
+        (("EPSG:32650", "EPSG:32650"), 400.0, False),
+        ((None, "EPSG:32650"), 45.0, False),
+    ],
+)
+def test_heights_from_two_surfaces_are_named(monkeypatch, systems, rise, is_said):
+    matrix = np.eye(4)
+    matrix[2, 3] = rise
+    monkeypatch.setattr(registering, "search", lambda *_, **__: nothing(matrix))
+    pair = [on_map(name, crs=crs) for name, crs in zip(("scan", "drone"), systems, strict=True)]
+    said = " ".join(registering.register(*pair).notes)
+    assert (f"drone lies {rise:+.2f} m higher: as heights above the ellipsoid" in said) is is_said
