@@ -229,6 +229,23 @@ def test_a_lost_source_is_said(tmp_path):
     assert np.abs(again.frame.to_file(again.xyz) - cloud.frame.to_file(cloud.xyz)).max() < 2e-9
 
 
+def test_a_number_beyond_its_field_is_said(tmp_path):
+    cloud = read_stations(survey(tmp_path / "a.e57"))[0]
+    cloud = cloud.with_attribute("row_index", np.full(len(cloud), -1))
+    with pytest.raises(OutputError, match=r"rowIndex holds .* and its E57 field takes 0 to"):
+        write(cloud, tmp_path / "b.e57")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.e57"]
+
+
+def test_the_same_points_elsewhere_are_another_scan(tmp_path):
+    """An id stands for one version of a scan, its pose included."""
+    cloud = read_stations(survey(tmp_path / "a.e57"))[0]
+    write(cloud, tmp_path / "b.e57")
+    write(cloud.moved(motion()), tmp_path / "c.e57")
+    one, other = tree(tmp_path / "b.e57"), tree(tmp_path / "c.e57")
+    assert one["/data3D/0/guid"] != other["/data3D/0/guid"]
+
+
 def test_one_cloud_is_one_file(tmp_path):
     cloud = read(survey(tmp_path / "a.e57"))
     for name in ("b.e57", "c.e57"):

@@ -9,6 +9,7 @@ Source: ASTM E2807-11, sections 6 and 7.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -20,6 +21,12 @@ from dougong.errors import FormatError
 
 _SIGNATURE = b"ASTM-E57"
 _HEADER = struct.Struct("<8sIIQQQQ")
+SECTION = struct.Struct("<B7xQQQ")
+"""Head of a section: its kind, bytes, and the physical positions of data and index."""
+BLOB, TABLE = 0, 1
+"""Kinds of sections."""
+INDEX_PACKET, DATA_PACKET = 0, 1
+"""Kinds of packets in a table: the first byte of each."""
 _CHECKSUM = 4
 _COPY_PAGES = 4096
 _LEAST_PAGE, _MOST_PAGE = 128, 1 << 20
@@ -170,6 +177,58 @@ class Pages:
             )
             raise FormatError(msg)
         return pages
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Where the bytes of a table of points or of a blob lie; positions are logical."""
+
+    kind: int
+    """`BLOB` or `TABLE`."""
+    start: int
+    stop: int
+    data: int
+    """First packet of a table."""
+    index: int
+    """First index packet of a table, physical; 0: none."""
+
+
+def read_section(pages: Pages, place: int) -> Section:
+    """Read the head of the section at the physical position `place`."""
+    start = pages.layout.logical(place)
+    kind, length, data, index = SECTION.unpack(pages.read(start, SECTION.size))
+    return Section(kind, start, start + length, pages.layout.logical(data), index)
+
+
+def packet_batches(
+    pages: Pages, section: Section, batch_bytes: int = 8 << 20
+) -> Iterator[tuple[int, bytearray, list[int]]]:
+    """Yield (logical start, bytes, where packets begin in them) for some whole packets at a time.
+
+    Raises
+    ------
+    FormatError
+        A packet runs past its section.
+    """
+    at = section.data
+    while at < section.stop:
+        batch = bytearray(pages.read(at, min(batch_bytes, section.stop - at)))
+        begins, used = [], 0
+        while used + 4 <= len(batch):
+            size = struct.unpack_from("<H", batch, used + 2)[0] + 1
+            if used + size > len(batch):
+                break
+            begins.append(used)
+            used += size
+        if not used:
+            msg = (
+                f"{pages.name}: a packet of a scan runs past its section. The input is damaged; "
+                "export it again."
+            )
+            raise FormatError(msg)
+        del batch[used:]
+        yield at, batch, begins
+        at += used
 
 
 class Appender:

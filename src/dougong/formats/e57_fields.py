@@ -76,8 +76,8 @@ class FieldSpec:
             return 32 if self.is_single else 64
         return (int(self.high) - int(self.low)).bit_length()
 
-    def raw(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values (n,) as the numbers that a file stores: integers as int64, floats.
+    def raw(self, values: NDArray[Any], name: str) -> NDArray[Any]:
+        """Return values (n,) of field `name` as a file stores them: int64 or floats.
 
         Raises
         ------
@@ -94,8 +94,8 @@ class FieldSpec:
         )
         if len(integers) and not (self.low <= integers.min() and integers.max() <= self.high):
             msg = (
-                f"a number of {integers.min()} to {integers.max()} does not fit its E57 field, "
-                f"which holds {self.low} to {self.high}."
+                f"{name} holds {integers.min()} to {integers.max()} (stored integers), and its E57 "
+                f"field takes {self.low} to {self.high}. Write another format."
             )
             raise OutputError(msg)
         return integers

@@ -8,7 +8,6 @@ Source: ASTM E2807-11, sections 9.2 to 9.5.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,10 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong.errors import FormatError
-from dougong.formats.e57_container import Pages
+from dougong.formats.e57_container import (
+    DATA_PACKET,
+    TABLE,
+    Pages,
+    packet_batches,
+    read_section,
+)
 
-_SECTION = struct.Struct("<B7xQQQ")
-_COMPRESSED_VECTOR, _DATA_PACKET = 1, 1
 _BATCH_BYTES = 8 << 20
 
 
@@ -58,7 +61,11 @@ def scale_floats(pages: Pages, fields: FloatFields) -> None:
         The section does not hold the packets that it should.
     """
     streams = {number: _Stream(np.dtype(kind)) for number, kind in fields.chosen.items()}
-    for start, batch, pieces in _batches(pages, fields):
+    section = read_section(pages, fields.place)
+    if section.kind != TABLE:
+        raise _damaged(pages, f"a scan's section is of kind {section.kind}, expected {TABLE}")
+    for start, batch, begins in packet_batches(pages, section, _BATCH_BYTES):
+        pieces = _pieces(pages, batch, begins, fields)
         for number, stream in streams.items():
             _scale_batch(pages, start, batch, pieces[number], stream, fields.factor)
         pages.write(start, batch)
@@ -68,53 +75,28 @@ def scale_floats(pages: Pages, fields: FloatFields) -> None:
         raise _damaged(pages, what)
 
 
-def _batches(
-    pages: Pages, fields: FloatFields
-) -> Iterator[tuple[int, bytearray, dict[int, list[slice]]]]:
-    """Yield (logical start, bytes, slices of each chosen stream) of some whole packets."""
-    layout = pages.layout
-    begin = layout.logical(fields.place)
-    kind, length, first, _ = _SECTION.unpack(pages.read(begin, _SECTION.size))
-    if kind != _COMPRESSED_VECTOR:
-        raise _damaged(pages, f"a scan's section has the type {kind}, expected 1")
-    at, stop = layout.logical(first), begin + length
-    while at < stop:
-        batch = bytearray(pages.read(at, min(_BATCH_BYTES, stop - at)))
-        pieces, used = _pieces(pages, batch, fields)
-        if not used:
-            raise _damaged(pages, "a packet of a scan runs past its section")
-        del batch[used:]
-        yield at, batch, pieces
-        at += used
-
-
 def _damaged(pages: Pages, what: str) -> FormatError:
     return FormatError(f"{pages.name}: {what}. The input is damaged; export it again.")
 
 
 def _pieces(
-    pages: Pages, batch: bytearray, fields: FloatFields
-) -> tuple[dict[int, list[slice]], int]:
-    """Return where the chosen streams lie in the whole packets of `batch`, and their bytes."""
+    pages: Pages, batch: bytearray, begins: list[int], fields: FloatFields
+) -> dict[int, list[slice]]:
+    """Return where the chosen streams lie in the packets of `batch`."""
     found: dict[int, list[slice]] = {number: [] for number in fields.chosen}
-    at = 0
-    while at + 4 <= len(batch):
-        size = struct.unpack_from("<H", batch, at + 2)[0] + 1
-        if at + size > len(batch):
-            break
-        if batch[at] == _DATA_PACKET:
-            count = struct.unpack_from("<H", batch, at + 4)[0]
-            if count != fields.streams:
-                raise _damaged(
-                    pages, f"a packet holds {count} fields, its scan has {fields.streams}"
-                )
-            place = at + 6 + 2 * count
-            for number, length in enumerate(struct.unpack_from(f"<{count}H", batch, at + 6)):
-                if number in found:
-                    found[number].append(slice(place, place + length))
-                place += length
-        at += size
-    return found, at
+    for begin in begins:
+        if batch[begin] != DATA_PACKET:
+            continue
+        count = struct.unpack_from("<H", batch, begin + 4)[0]
+        if count != fields.streams:
+            what = f"a packet holds {count} fields, its scan has {fields.streams}"
+            raise _damaged(pages, what)
+        place = begin + 6 + 2 * count
+        for number, length in enumerate(struct.unpack_from(f"<{count}H", batch, begin + 6)):
+            if number in found:
+                found[number].append(slice(place, place + length))
+            place += length
+    return found
 
 
 def _scale_batch(

@@ -13,12 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.formats.e57_container import Appender
+from dougong.formats.e57_container import (
+    DATA_PACKET,
+    INDEX_PACKET,
+    SECTION,
+    TABLE,
+    Appender,
+)
 from dougong.formats.e57_fields import FieldSpec
 
-_SECTION = struct.Struct("<B7xQQQ")
 _INDEX_PACKET = struct.Struct("<BBHHB9xQQ")
-_DATA, _POINTS = 1, 1
 _MOST_PACKET = 65_536
 _PACKETS_AT_ONCE = 64
 
@@ -47,7 +51,7 @@ class _Plan:
         lengths = self.lengths(records)
         return struct.pack(
             f"<BBHH{len(lengths)}H",
-            _DATA, 0, self.packet_bytes(records) - 1, len(lengths), *lengths,
+            DATA_PACKET, 0, self.packet_bytes(records) - 1, len(lengths), *lengths,
         )  # fmt: skip
 
     @property
@@ -75,18 +79,23 @@ def write_section(
     start = out.tell()
     count = len(next(iter(fields.values()))[1])
     plan = _Plan([spec for spec, _ in fields.values()], count)
-    data = start + _SECTION.size
+    data = start + SECTION.size
     index = data + plan.data_bytes
     length = index + _INDEX_PACKET.size - start
-    out.write(_SECTION.pack(_POINTS, length, out.physical(data), out.physical(index)))
+    out.write(SECTION.pack(TABLE, length, out.physical(data), out.physical(index)))
     block = plan.records * _PACKETS_AT_ONCE
     for first in range(0, count, block):
         stop = min(first + block, count)
-        streams = [spec.packed(spec.raw(values[first:stop])) for spec, values in fields.values()]
+        streams = [
+            spec.packed(spec.raw(values[first:stop], name))
+            for name, (spec, values) in fields.items()
+        ]
         for stream in streams:
             seen(stream)
         _write_packets(out, plan, streams, stop - first)
-    out.write(_INDEX_PACKET.pack(0, 0, _INDEX_PACKET.size - 1, 1, 0, 0, out.physical(data)))
+    out.write(
+        _INDEX_PACKET.pack(INDEX_PACKET, 0, _INDEX_PACKET.size - 1, 1, 0, 0, out.physical(data))
+    )
     return out.physical(start)
 
 

@@ -186,7 +186,9 @@ class _Writer:
                     "the table of scan lines is left out: points may have gone from the lines."
                 )
         _limits(scan, station.fields, has_own=before is not None)
-        guid = _guid("dougong", station.guid, self._points(scan, station))
+        place = [*station.pose.quaternion, *station.pose.translation]
+        content = self._points(scan, station), *map(words, place)
+        guid = _guid("dougong", station.guid, *content)
         put(scan, "guid", "String", guid)
         if station.header is not None and station.guid:
             _originals(scan, child(before, "originalGuids"), station.guid)
