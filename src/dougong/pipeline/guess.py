@@ -108,6 +108,7 @@ def project_text(title: str, guesses: list[Guess], skipped: list[str]) -> str:
         "[project]",
         f"name = {_quoted(title)}",
         f"reference = {_quoted(reference)}   # the cloud whose coordinates the result has",
+        "# full_resolution = true   # also write every input file, undecimated, in that frame",
     ]
     for guess in guesses:
         lines += [
