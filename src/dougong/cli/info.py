@@ -19,7 +19,7 @@ def command(*files: Path, common: Common = DEFAULT) -> int:
     Parameters
     ----------
     files
-        LAS, LAZ, COPC, E57, PLY, PCD, XYZ, PTS or CSV files.
+        LAS, LAZ, COPC, E57, PLY, PCD, XYZ, PTS, PTX or CSV files.
     """
 
     def work(progress: Listener) -> Answer:

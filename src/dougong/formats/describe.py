@@ -47,7 +47,7 @@ def _info(path: Path, kind: str, scans: list[Scan], survey: Survey) -> FileInfo:
     notes = [note for scan in scans for note in scan.notes]
     return FileInfo(
         path=path,
-        format={"e57": "E57", "ply": "PLY", "pcd": "PCD", "text": "text"}[kind],
+        format={"e57": "E57", "ply": "PLY", "pcd": "PCD", "text": "text", "ptx": "PTX"}[kind],
         version=_version(kind, first),
         points=survey.rows,
         bytes=path.stat().st_size,
@@ -74,4 +74,6 @@ def _version(kind: str, scan: Any) -> str:
     if kind == "pcd":
         words = dict(scan.header.lines)
         return f"{' '.join(words.get('VERSION', ('?',)))} {scan.encoding}"
+    if kind == "ptx":
+        return f"{scan.columns} columns"
     return "1.0" if kind == "e57" else f"{len(scan.names)} columns"

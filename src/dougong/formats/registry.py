@@ -17,16 +17,16 @@ from dougong.formats.units import is_same_crs, metre_form
 
 SUFFIXES = {
     ".las": "las", ".laz": "las", ".e57": "e57", ".ply": "ply", ".pcd": "pcd",
-    ".xyz": "text", ".pts": "text", ".csv": "text", ".txt": "text", ".asc": "text",
+    ".xyz": "text", ".pts": "text", ".csv": "text", ".txt": "text", ".asc": "text", ".ptx": "ptx",
 }  # fmt: skip
 _SIGNATURES = ((b"LASF", "las"), (b"ASTM-E57", "e57"), (b"ply", "ply"), (b"# .PCD", "pcd"))
-_SHOWN = {"las": "LAS/LAZ", "e57": "E57", "ply": "PLY", "pcd": "PCD", "text": "text"}
+_SHOWN = {"las": "LAS/LAZ", "e57": "E57", "ply": "PLY", "pcd": "PCD", "text": "text", "ptx": "PTX"}
 BLOCK_ROWS = 1_000_000
 WRITABLE = (".las", ".laz", ".copc.laz", ".e57", ".ply")
 
 
 def kind_of(path: Path) -> str:
-    """Return "las", "e57", "ply", "pcd" or "text" for a file that can be opened.
+    """Return "las", "e57", "ply", "pcd", "ptx" or "text" for a file that can be opened.
 
     Raises
     ------
@@ -72,13 +72,17 @@ def scans_of(path: Path, kind: str) -> list[Scan]:
         from dougong.formats.pcd import open_pcd
 
         return [open_pcd(path)]
+    if kind == "ptx":
+        from dougong.formats.ptx import open_ptx
+
+        return list(open_ptx(path))
     from dougong.formats.text import open_text
 
     return [open_text(path)]
 
 
 def read_stations(path: Path | str) -> list[Cloud]:
-    """Return one cloud per scan of an E57 file, poses applied, in one frame; else one cloud.
+    """Return one cloud per scan of an E57 or PTX file, poses applied, in one frame; else one cloud.
 
     Raises
     ------
@@ -105,8 +109,8 @@ def read_stations(path: Path | str) -> list[Cloud]:
 def read(path: Path | str) -> Cloud:
     """Return a whole point cloud file.
 
-    An E57 file with several scans becomes one cloud with the uint16 attribute `station`, counted
-    from 0 in the order of the file; use `read_stations` to keep them apart.
+    An E57 or PTX file with several scans becomes one cloud with the uint16 attribute `station`,
+    counted from 0 in the order of the file; use `read_stations` to keep them apart.
 
     Raises
     ------
@@ -160,8 +164,8 @@ def iterate(path: Path | str, chunk_points: int = 1_000_000) -> Iterator[Cloud]:
     """Yield a file in clouds of at most `chunk_points` points that share one frame.
 
     The file is never held as a whole (PCD binary_compressed is one block by design: it is).
-    E57, PLY, PCD and text are passed over twice, LAS once. Scans of an E57 file follow one
-    another; `cloud.header.station` tells them apart.
+    All but LAS are passed over twice. Scans of an E57 or PTX file follow one another;
+    `cloud.header.station` tells them apart.
 
     Raises
     ------

@@ -53,7 +53,7 @@ def parse_rows(
     left = np.inf if count is None else count
     with opened(path) as file:
         file.seek(start)
-        for data in _lines(file, rows, layout.has_old_line_ends):
+        for data in _lines(file, int(min(rows, left)), layout.has_old_line_ends):
             table = table_of(data, layout)
             for first in range(0, len(table), rows):
                 if left <= 0:

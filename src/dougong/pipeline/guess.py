@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dougong.errors import DougongError, InputError
-from dougong.formats import FileInfo, describe
+from dougong.formats import SUFFIXES, FileInfo, describe
 from dougong.pipeline.project import stem
 from dougong.typing import Kind
 
-SUFFIXES = (".las", ".laz", ".e57", ".ply", ".pcd", ".xyz", ".pts", ".ptx", ".csv", ".txt")
 _COLOURS = {"red", "green", "blue"}
 # A scanner's own frame starts at the first station; a map's easting and northing do not.
 _MAP_COORDINATE_M = 20_000.0
@@ -33,8 +32,9 @@ def guess_kind(info: FileInfo) -> tuple[Kind, str]:
     has_colour = names >= _COLOURS
     low = info.extent_min or (0.0, 0.0, 0.0)
     is_map = info.crs_wkt is not None or max(abs(low[0]), abs(low[1])) > _MAP_COORDINATE_M
-    if info.format.upper() == "E57" or info.stations > 1:
-        return "lidar", f"{info.stations} scan(s) in an E57 file"
+    if info.format in ("E57", "PTX"):
+        scans = "1 scan" if info.stations == 1 else f"{info.stations} scans"
+        return "lidar", f"{scans} in a file of {info.format}"
     if names & {"station", "scan_angle", "return_number"} and not has_colour:
         return "lidar", "scanner attributes and no colour"
     if has_colour and is_map:

@@ -83,7 +83,7 @@ def stations_of(file: Path, *, split: bool) -> Iterator[Iterator[Cloud]]:
 
 def len_stations(file: Path) -> int:
     """Return how many scans a file keeps apart."""
-    return describe(file).stations if file.suffix.lower() == ".e57" else 1
+    return describe(file).stations if file.suffix.lower() in (".e57", ".ptx") else 1
 
 
 def _marked_with_station(chunks: Iterator[Cloud], file: Path) -> Iterator[Cloud]:
