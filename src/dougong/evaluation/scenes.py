@@ -150,6 +150,7 @@ def scan_mesh(
     max_tilt_deg: float = 0.6,
     scanner: scanners.Scanner | None = None,
     drone: drones.Drone | None = None,
+    on_map: Map | None = None,
 ) -> Scene:
     """Survey any triangle mesh twice, as `make_scene` does its own buildings.
 
@@ -165,7 +166,7 @@ def scan_mesh(
         How many scanner positions to find, or the positions, in the mesh's coordinates.
     ground : bool
         Lay gently rolling ground under and round the mesh, at its foot.
-    lidar_points, photogrammetry_points, bending, outliers, max_tilt_deg, scanner, drone
+    lidar_points, photogrammetry_points, bending, outliers, max_tilt_deg, scanner, drone, on_map
         As for `make_scene`.
 
     Raises
@@ -190,7 +191,7 @@ def scan_mesh(
     update = {"outliers": outliers}
     surveyor = (scanner or scanners.Scanner()).model_copy(update={"points": lidar_points, **update})
     pilot = (drone or drones.Drone()).model_copy(update={"points": photogrammetry_points, **update})
-    return survey(name, seed, world, surveyor, pilot, bending, max_tilt_deg, tracer)
+    return survey(name, seed, world, surveyor, pilot, bending, max_tilt_deg, tracer, on_map)
 
 
 def _world_of_mesh(
