@@ -33,7 +33,12 @@ def length_text(metres: float) -> str:
 
 
 def plate(
-    image: Image, view: View, label: str, marks: tuple[Mark, ...] = (), text_px: int = 16
+    image: Image,
+    view: View,
+    label: str,
+    marks: tuple[Mark, ...] = (),
+    text_px: int = 16,
+    over: str = "",
 ) -> str:
     """Return an SVG of `image` with a scale bar.
 
@@ -48,6 +53,8 @@ def plate(
         Rectangles round enlarged parts.
     text_px : int
         Size of the text, in pixels of the picture: larger where the page shows it smaller.
+    over : str
+        More SVG, drawn over the picture.
     """
     height, width = image.shape[:2]
     data = base64.b64encode(png(image)).decode("ascii")
@@ -63,7 +70,7 @@ def plate(
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{text}">'
         f'<image width="{width}" height="{height}" href="data:image/png;base64,{data}"/>'
-        f"{frames}"
+        f"{frames}{over}"
         f'<path class="bar" d="M18 {y - 6}V{y}H{18 + pixels:.1f}V{y - 6}"/>'
         f'<text class="bar-text" x="{26 + pixels:.1f}" y="{y + 1}" style="font-size:{text_px}px">'
         f"{length_text(bar)}</text></svg>"
