@@ -1,6 +1,6 @@
 """Who saw what, how densely, and where to go back: walls, and holes in plan."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +11,8 @@ from scipy import ndimage
 from dougong.filters import neighbourhood
 from dougong.report.figures import Figure, Place
 from dougong.report.layers import Layer, near
-from dougong.report.maps import axes_of, lay_sheet, sheet_plate
-from dougong.typing import Mask, Points, Values
+from dougong.report.maps import Sheet, axes_of, lay_sheet, sheet_plate
+from dougong.typing import Index, Mask, Points, Values
 
 _SAMPLE = 250_000
 _NEIGHBOURS = 16
@@ -20,12 +20,14 @@ _CELL_M = 0.5
 _LEAST_POINTS = 3
 _WALL = 0.5
 _PLACES = 5
+_FEWEST = 20
 _LEAST_PLACE_M2 = 1.0
 SCALES = (20, 50, 100, 200)
 _PAPER_MM = 0.1
 BOTH, SCAN, DRONE = 0, 1, 2
-_COLOURS = np.array([[120, 130, 138], [45, 125, 195], [230, 125, 30]], dtype=np.uint8)
-"""Grey both, blue scan only, orange drone only; hatched too, so that colour is not all."""
+_COLOURS = np.array([[120, 130, 138], [230, 125, 30], [45, 125, 195]], dtype=np.uint8)
+"""Grey both, orange scan only, blue drone only, as the clouds usually are; what the drone alone saw
+has crosses too, so that colour is not all."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +49,9 @@ class _Walls:
 
     middle: Points
     normals: Points
-    seen: Values
+    seen: Index
+    area: Values
+    """Square metres."""
     spacing: Values
     """Of the scan's points, metres; infinite where it has none."""
 
@@ -57,7 +61,7 @@ def coverage(layers: list[Layer], result: Mapping[str, Any], place: Place) -> Co
     kinds = {cloud["name"]: (cloud["kind"], cloud["points_out"]) for cloud in result["clouds"]}
     sure = [layer for layer in layers if layer.is_sure and layer.name in kinds]
     heights = np.array([place.floor - 1.0, place.top + 1.0])
-    shown = near(sure, place.centre, 1.1 * place.radius, heights)
+    shown = near(sure, place.centre, 1.3 * place.radius, heights)
     groups: list[list[tuple[Points, float]]] = [[], []]
     for whole, layer in zip(sure, shown, strict=True):
         kind, points = kinds[layer.name]
@@ -68,8 +72,7 @@ def coverage(layers: list[Layer], result: Mapping[str, Any], place: Place) -> Co
     walls = _walls(groups)
     if walls is None:
         return None
-    area = _CELL_M**2
-    totals = [float((walls.seen == kind).sum()) * area for kind in (BOTH, SCAN, DRONE)]
+    totals = [float(walls.area[walls.seen == kind].sum()) for kind in (BOTH, SCAN, DRONE)]
     hole = _holes(groups)
     words = (
         f"Of about {sum(totals):,.0f} m² of wall, both sensors saw {totals[BOTH]:,.0f} m², only "
@@ -99,45 +102,65 @@ def coverage(layers: list[Layer], result: Mapping[str, Any], place: Place) -> Co
 def _walls(groups: list[list[tuple[Points, float]]]) -> _Walls | None:
     """Return the wall voxels of both sensors."""
     every = np.concatenate([xyz for group in groups for xyz, _ in group])
-    sample = every[:: max(1, len(every) // _SAMPLE)]
-    surface = neighbourhood.normals(sample, _NEIGHBOURS, 2.0 * _CELL_M)
-    is_wall = (np.abs(surface.normals[:, 2]) < _WALL) & (surface.variation < 0.05)
     low = every.min(axis=0) - _CELL_M
     size = np.ceil((every.max(axis=0) - low) / _CELL_M).astype(np.int64) + 2
+    strides = np.array([size[1] * size[2], size[2], 1], dtype=np.int64)
 
-    def keys(points: Points) -> Any:
-        cell = np.floor((points - low) / _CELL_M).astype(np.int64)
-        return (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+    def keys(points: Points) -> Index:
+        cells = np.floor((points - low) / _CELL_M).astype(np.int64)
+        return np.asarray(cells @ strides)
 
-    known, at, asked = np.unique(keys(sample), return_inverse=True, return_counts=True)
-    share = np.bincount(at.reshape(-1), is_wall, len(known)) / asked
-    voxels = known[share > 0.5]
-    if len(voxels) < 20:
+    voxels, normals = _upright(every[:: max(1, len(every) // _SAMPLE)], keys)
+    if len(voxels) < _FEWEST:
         return None
     counts = [np.zeros(len(voxels)), np.zeros(len(voxels))]
     for side, group in enumerate(groups):
         for xyz, times in group:
-            key = keys(xyz)
-            place = np.minimum(np.searchsorted(voxels, key), len(voxels) - 1)
-            hit = voxels[place] == key
+            place, hit = _find(voxels, keys(xyz))
             counts[side] += times * np.bincount(place[hit], minlength=len(voxels))
     scan, drone = (count >= _LEAST_POINTS for count in counts)
-    seen = np.where(scan & drone, BOTH, np.where(scan, SCAN, DRONE)).astype(np.float64)
     stays = scan | drone
-    place = np.minimum(np.searchsorted(voxels, known[at.reshape(-1)]), len(voxels) - 1)
-    member = is_wall & (voxels[place] == known[at.reshape(-1)])
-    normals = np.zeros((len(voxels), 3))
-    np.add.at(normals, place[member], surface.normals[member])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     cells = np.column_stack(np.unravel_index(voxels, tuple(size)))
     with np.errstate(divide="ignore"):
         spacing = np.sqrt(_CELL_M**2 / counts[0])
     return _Walls(
         middle=(low + (cells + 0.5) * _CELL_M)[stays],
         normals=normals[stays],
-        seen=seen[stays],
+        seen=np.where(scan & drone, BOTH, np.where(scan, SCAN, DRONE))[stays],
+        area=_areas(voxels[stays], normals[stays], strides),
         spacing=np.where(scan, spacing, np.inf)[stays],
     )
+
+
+def _find(voxels: Index, asked: Index) -> tuple[Index, Mask]:
+    """Return the place of each asked key among sorted `voxels`, and whether it is there."""
+    place = np.minimum(np.searchsorted(voxels, asked), len(voxels) - 1)
+    return place.astype(np.int64), voxels[place] == asked
+
+
+def _upright(sample: Points, keys: Callable[[Points], Index]) -> tuple[Index, Points]:
+    """Return the sorted keys of voxels that hold mostly wall, and their mean normals."""
+    surface = neighbourhood.normals(sample, _NEIGHBOURS, 2.0 * _CELL_M)
+    is_wall = (np.abs(surface.normals[:, 2]) < _WALL) & (surface.variation < 0.05)
+    key = keys(sample)
+    known, at, asked = np.unique(key, return_inverse=True, return_counts=True)
+    voxels = known[np.bincount(at.reshape(-1), is_wall, len(known)) / asked > 0.5]
+    normals = np.zeros((len(voxels), 3))
+    if len(voxels):
+        place, hit = _find(voxels, key)
+        member = is_wall & hit
+        np.add.at(normals, place[member], surface.normals[member])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return voxels, normals
+
+
+def _areas(voxels: Index, normals: Points, strides: Index) -> Values:
+    """Return the wall in each voxel, square metres: one that lies in two rows counts once."""
+    level = np.abs(normals[:, :2])
+    stride = strides[np.argmax(level, axis=1)]
+    rows = 1.0 + sum(_find(voxels, voxels + side * stride)[1] for side in (-1, 1))
+    lean = np.maximum(level.max(axis=1), 0.5)
+    return np.asarray(_CELL_M**2 / (rows * lean))
 
 
 def _scales(walls: _Walls) -> tuple[tuple[str, str, str], ...]:
@@ -146,10 +169,14 @@ def _scales(walls: _Walls) -> tuple[tuple[str, str, str], ...]:
         (
             f"1:{scale}",
             f"{scale * _PAPER_MM:g} mm",
-            f"{100 * float(np.mean(walls.spacing <= scale * _PAPER_MM / 1000.0)):.0f} %",
+            f"{100 * _share(walls, walls.spacing <= scale * _PAPER_MM / 1000.0):.0f} %",
         )
         for scale in SCALES
     )
+
+
+def _share(walls: _Walls, chosen: Mask) -> float:
+    return float(walls.area[chosen].sum() / max(float(walls.area.sum()), 1e-12))
 
 
 def _places(walls: _Walls, layers: list[Layer]) -> tuple[str, ...]:
@@ -163,7 +190,7 @@ def _places(walls: _Walls, layers: list[Layer]) -> tuple[str, ...]:
     grid[tuple(cells.T)] = True
     label, count = ndimage.label(grid, np.ones((3, 3, 3)))
     own = label[tuple(cells.T)]
-    sizes = np.bincount(own, minlength=count + 1) * _CELL_M**2
+    sizes = np.bincount(own, walls.area[walls.seen == DRONE], minlength=count + 1)
     floor = float(np.quantile(walls.middle[:, 2], 0.02))
     words = []
     for number in np.argsort(-sizes, kind="stable")[:_PLACES]:
@@ -204,10 +231,11 @@ def _map(walls: _Walls, chosen: Mask, normal: Values) -> Figure:
     order = np.argsort(walls.middle[chosen] @ normal, kind="stable")
     seen = np.full(sheet.rows * sheet.columns, -1, dtype=np.int64)
     inside = cells[order] >= 0
-    seen[cells[order][inside]] = walls.seen[chosen][order][inside].astype(np.int64)
+    seen[cells[order][inside]] = walls.seen[chosen][order][inside]
     colours = _COLOURS[np.maximum(seen, 0)]
     bearing = np.degrees(np.arctan2(normal[1], normal[0])) % 360.0
-    lonely = 100.0 * float((walls.seen[chosen] == DRONE).mean())
+    area = walls.area[chosen]
+    lonely = 100.0 * float(area[walls.seen[chosen] == DRONE].sum() / area.sum())
     return Figure(
         title=f"From the side {bearing:.0f} deg from +x towards +y",
         caption=f"{lonely:.0f} % of this wall was seen by the drone only (crosses).",
@@ -217,9 +245,9 @@ def _map(walls: _Walls, chosen: Mask, normal: Values) -> Figure:
     )
 
 
-def _crosses(sheet: Any, is_marked: Mask) -> str:
+def _crosses(sheet: Sheet, is_marked: Mask) -> str:
     """Return a small cross on each marked cell, as SVG."""
-    times = max(1, round(900 / sheet.columns))
+    times = sheet.pixels
     size = 0.3 * times
     rows, columns = np.nonzero(is_marked.reshape(sheet.rows, sheet.columns))
     path = "".join(

@@ -37,6 +37,11 @@ class Sheet:
     columns: int
     rows: int
 
+    @property
+    def pixels(self) -> int:
+        """Return how many pixels of the picture a cell is wide."""
+        return max(1, round(_WIDE_PX / self.columns))
+
     def cells(self, points: Points) -> NDArray[np.int64]:
         """Return the cell (n,) of each point, row by row from the top; -1 outside."""
         across = np.floor((points @ self.right - self.low[0]) / self.cell_m).astype(np.int64)
@@ -95,7 +100,7 @@ def sheet_plate(
     image = np.zeros((sheet.rows * sheet.columns, 4), dtype=np.uint8)
     image[is_shown, :3] = colours[is_shown]
     image[is_shown, 3] = 255
-    times = _times(sheet)
+    times = sheet.pixels
     picture = image.reshape(sheet.rows, sheet.columns, 4)
     picture = cv2.resize(picture, None, fx=times, fy=times, interpolation=cv2.INTER_NEAREST)
     foot = np.zeros((max(40, 130 - picture.shape[0]), picture.shape[1], 4), dtype=np.uint8)
@@ -113,14 +118,10 @@ def sheet_plate(
     return plate(picture, view, label, text_px=20, over=over)
 
 
-def _times(sheet: Sheet) -> int:
-    return max(1, round(_WIDE_PX / sheet.columns))
-
-
 def signs(sheet: Sheet, values: Values, is_told: NDArray[np.bool_]) -> str:
     """Return + and - marks as SVG where most cells of a tile are on one side: colour is not all."""
-    tile = max(3, -(-max(sheet.columns, 12) // _TILES_ACROSS))
-    times = _times(sheet)
+    tile = max(5, -(-sheet.columns // _TILES_ACROSS))
+    times = sheet.pixels
     grid = np.where(is_told, np.sign(np.nan_to_num(values)), 0.0).reshape(sheet.rows, -1)
     seen = np.isfinite(values).reshape(sheet.rows, -1)
     marks = []

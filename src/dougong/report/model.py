@@ -1,7 +1,7 @@
 """The report as plain data: what is said, before anything is drawn."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -10,8 +10,9 @@ Tone = Literal["good", "unsure", "bad"]
 TONES: dict[str, Tone] = {"ok": "good", "ambiguous": "unsure", "failed": "bad"}
 WORDS: dict[Tone, str] = {"good": "Registered", "unsure": "Ambiguous", "bad": "Not registered"}
 NO_CHECKS = (
-    "No independent check points were given: no accuracy grade is stated. The numbers on this "
-    "page say how well the clouds fit each other, not how well they fit the world."
+    "No independent check points were given: no accuracy grade is stated (no USIBD level of "
+    "accuracy, LOA). The numbers on this page say how well the clouds fit each other, not how "
+    "well they fit the world."
 )
 
 
@@ -99,6 +100,7 @@ def from_run(result: Mapping[str, Any], demo: Mapping[str, Any] | None) -> Repor
         notes=tuple(result["notes"]),
         outputs=(
             ("merged.copc.laz", _merged(result["merged"])),
+            ("distances/", "the core points with their signed distances"),
             ("clouds/", "each filtered cloud in the frame of the reference"),
             (
                 "registrations/",
@@ -119,8 +121,8 @@ def from_registration(document: Mapping[str, Any]) -> Report:
     return Report(
         title=f"{document['source']} onto {document['target']}",
         subtitle="Registration of two clouds",
-        verdict=Verdict(tone=only.tone, word=only.word, sentence=sentence(document["reason"])),
-        key_numbers=tuple(_fit_numbers([document])),
+        verdict=Verdict(tone=only.tone, word=only.word, sentence=_plain(document)),
+        key_numbers=tuple(_pair_numbers([document])),
         checks=NO_CHECKS,
         clouds=(),
         links=(only,),
@@ -161,6 +163,22 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
 
 
+def _plain(document: Mapping[str, Any]) -> str:
+    """Return the verdict on one registration in words for people who sign it."""
+    left = _left(document)
+    if document["status"] != "ok" or not left:
+        return sentence(document["reason"])
+    return (
+        f"{document['source']} fits {document['target']} at one pose, and at none of the others "
+        f"that were searched for. {left}"
+    )
+
+
+def _left(document: Mapping[str, Any]) -> str:
+    """Return what the registration leaves, in one sentence; empty where it was not measured."""
+    return str((document.get("distances") or {}).get("sentence", ""))
+
+
 def _run_verdict(result: Mapping[str, Any], demo: Mapping[str, Any] | None) -> Verdict:
     documents = result["registrations"]
     tone = TONES[result["status"]]
@@ -171,10 +189,10 @@ def _run_verdict(result: Mapping[str, Any], demo: Mapping[str, Any] | None) -> V
     if demo is not None and demo["tre95_m"] is not None:
         words = (
             f"The pose lies {1000 * demo['tre95_m']:.1f} mm from the truth (95 % of the surface): "
-            f"{demo['verdict']}."
-        )
+            f"{demo['verdict']}. {_left(documents[0])}"
+        ).strip()
     elif len(documents) == 1:
-        words = sentence(documents[0]["reason"])
+        words = _plain(documents[0])
     else:
         words = f"{sure} of {len(documents)} clouds were registered with certainty."
     if tone != "good":
@@ -188,7 +206,7 @@ def _key_numbers(
     if demo is not None and demo["tre95_m"] is not None:
         return _truth_numbers(demo)
     if result["registrations"]:
-        return tuple(_fit_numbers(result["registrations"]))
+        return tuple(_pair_numbers(result["registrations"]))
     cloud = result["clouds"][0]
     return (
         KeyNumber(
@@ -239,6 +257,45 @@ def _truth_numbers(demo: Mapping[str, Any]) -> tuple[KeyNumber, ...]:
             ),
         ),
     )
+
+
+def _pair_numbers(documents: Sequence[Mapping[str, Any]]) -> list[KeyNumber]:
+    """Return what is left between the clouds; where it was not measured, how the fit went."""
+    fit = _fit_numbers(documents)
+    measured = [document["distances"] for document in documents if document.get("distances")]
+    if not measured:
+        return fit
+    worst = max(measured, key=lambda found: float(found["within95_m"]))
+    more = " (the worst of all links)" if len(documents) > 1 else ""
+    return [
+        KeyNumber(
+            label="95 % of distances within",
+            value=f"{1e3 * worst['within95_m']:.1f}",
+            unit="mm",
+            definition=(
+                "between the two clouds along the surface's normal (M3C2), where both show it"
+                f"{more}; fit to each other, not accuracy"
+            ),
+        ),
+        KeyNumber(
+            label="Level of detection (95 %)",
+            value=f"{1e3 * worst['lod95_m']:.1f}",
+            unit="mm",
+            definition=(
+                "a smaller distance cannot be told from none: noise, roughness and the "
+                "registration's own uncertainty; the typical value"
+            ),
+        ),
+        replace(
+            fit[1], definition=f"share of the moved cloud with the other cloud {_reach(documents)}"
+        ),
+    ]
+
+
+def _reach(documents: Sequence[Mapping[str, Any]]) -> str:
+    """Return the distance bound of the overlap in words."""
+    bounds = [document["fine"]["max_distance_m"] for document in documents if document["fine"]]
+    return f"within {1000 * max(bounds):.0f} mm" if bounds else "near"
 
 
 def _fit_numbers(documents: Sequence[Mapping[str, Any]]) -> list[KeyNumber]:

@@ -50,8 +50,9 @@ def score_chart(hypotheses: tuple[Mapping[str, Any], ...], margin: float) -> str
             f"{margin:.2f}</text>"
         )
     ticks = "".join(
-        f'<text x="{at(yaw, 0)[0]:.0f}" y="{height - low + 18}" text-anchor="middle">{yaw}</text>'
-        for yaw in (-180, -90, 0, 90)
+        f'<text x="{at(yaw, 0)[0]:.0f}" y="{height - low + 18}" text-anchor="middle">'
+        f"{yaw:.0f}</text>"
+        for yaw in (-180, -90, 0, 90, 179.99)
     )
     return (
         f'<svg class="chart scores" viewBox="0 0 {width} {height}" role="img" aria-label="score of '

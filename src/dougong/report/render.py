@@ -10,10 +10,12 @@ from markupsafe import Markup
 
 from dougong.errors import InputError
 from dougong.pipeline.outputs import write_text
+from dougong.report.annex import Annex, annex_of
 from dougong.report.figures import Figure, find_place, overview, slices
 from dougong.report.layers import Layer, pair_layers, run_layers
 from dougong.report.model import Report, from_registration, from_run
 from dougong.report.plates import line_chart
+from dougong.report.poses import score_chart
 from dougong.report.viewer import View3D, view_3d, why_missing
 
 
@@ -45,7 +47,8 @@ def build(folder: Path) -> Path:
         )
         raise InputError(msg)
     path = folder / "report.html"
-    write_text(path, render(report, layers))
+    place = find_place(layers) if layers else None
+    write_text(path, render(report, layers, annex_of(folder, document, layers, place)))
     return path
 
 
@@ -55,27 +58,45 @@ def load(path: Path) -> dict[str, Any]:
     return document
 
 
-def render(report: Report, layers: list[Layer]) -> str:
+def render(report: Report, layers: list[Layer], annex: Annex | None = None) -> str:
     """Return the page. Everything is inside it: no request leaves it."""
     report = replace(
         report,
         legend=tuple((layer.name, "rgb({}, {}, {})".format(*layer.colour)) for layer in layers),
     )
+    first: Figure | None = None
     general: list[Figure] = []
     cuts: list[Figure] = []
     three: View3D | None = None
     missing = why_missing()
     if layers:
         place = find_place(layers)
-        general = overview(layers, place)
+        first, general = _first(overview(layers, place))
         sure = [layer for layer in layers if layer.is_sure]
         cuts = slices(sure, place) if len(sure) > 1 else []
         three = view_3d(layers, place) if missing is None else None
     return (
         environment()
         .get_template("report.html")
-        .render(report=report, overview=general, slices=cuts, three=three, missing=missing)
+        .render(
+            report=report,
+            first=first,
+            overview=general,
+            slices=cuts,
+            three=three,
+            missing=missing,
+            annex=annex or Annex(),
+        )
     )
+
+
+def _first(figures: list[Figure]) -> tuple[Figure | None, list[Figure]]:
+    """Return the picture of the first screen, registered clouds where there are any; the others."""
+    if not figures:
+        return None, []
+    after = [figure for figure in figures if figure.title.startswith("After")]
+    first = after[0] if after else figures[-1]
+    return first, [figure for figure in figures if figure is not first]
 
 
 def environment() -> jinja2.Environment:
@@ -92,6 +113,7 @@ def environment() -> jinja2.Environment:
     engine.filters["percent"] = lambda value: f"{100 * value:.2f} %"
     engine.filters["chart"] = _chart
     engine.filters["built"] = Markup
+    engine.filters["scores"] = lambda link: Markup(score_chart(link.hypotheses, link.margin))
     return engine
 
 

@@ -26,6 +26,7 @@ _FACADES = 3
 _SAME_SIDE = float(np.cos(np.radians(40.0)))
 _ROWS = 12
 _BARS = 60
+_CELL_SPACINGS = 2.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,7 +188,8 @@ def _map(
     words: str,
 ) -> Figure:
     xyz, distance, lod = core.xyz[chosen], core.distance[chosen], core.lod[chosen]
-    sheet = lay_sheet(xyz, *axes, 1.2 * spacing)
+    # Cells of several core points: one alone is noise, a patch of them is a finding.
+    sheet = lay_sheet(xyz, *axes, _CELL_SPACINGS * spacing)
     cells = sheet.cells(xyz)
     count = sheet.rows * sheet.columns
     value, detectable = medians(cells, distance, count), medians(cells, lod, count)
@@ -246,6 +248,5 @@ def _histogram(core: Core, found: Mapping[str, Any], limit: float) -> str:
         "</text>"
         f'<text x="{left}" y="{height - 6}">− behind, below</text>'
         f'<text x="{width - left}" y="{height - 6}" text-anchor="end">in front, above +</text>'
-        f'<text x="{width / 2}" y="{height - 6}" text-anchor="middle">mm; dashed: level of '
-        f"detection; the outer bars hold all beyond</text></svg>"
+        f'<text x="{width / 2}" y="{height - 6}" text-anchor="middle">mm</text></svg>'
     )
