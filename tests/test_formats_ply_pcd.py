@@ -274,3 +274,18 @@ def test_lzf_against_the_slow_twin():
         room = np.zeros(len(expected), np.uint8)
         assert unpack_lzf(np.frombuffer(bad, np.uint8), room) == -1
     assert unpack_lzf(np.frombuffer(packed, np.uint8), out[:10]) == -1, "no room"
+
+
+def test_colours_with_alpha_are_told_apart(tmp_path):
+    head = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgba\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+        "WIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA binary\n"
+    )
+    rows = np.zeros(2, dtype=[*((axis, "<f4") for axis in "xyz"), ("rgba", "<u4")])
+    rows["rgba"] = 0xFF010203, 0x80FF0000
+    (tmp_path / "a.pcd").write_bytes(head.encode() + rows.tobytes())
+    cloud = read(tmp_path / "a.pcd")
+    colours = [cloud.attribute(name).tolist() for name in ("red", "green", "blue", "alpha")]
+    assert colours == [[1, 255], [2, 0], [3, 0], [255, 128]]
+    write(cloud, tmp_path / "a.laz")
+    assert (read(tmp_path / "a.laz").attribute("red") // 257).tolist() == [1, 255]

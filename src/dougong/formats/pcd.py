@@ -15,11 +15,8 @@ from dougong.formats.stream import Block, opened, refuse_empty, stem_of
 from dougong.formats.text_rows import RowFormat, parse_rows
 
 _KINDS = {"F": "f", "U": "u", "I": "i"}
-_RGB = {
-    "red": BitField("rgb", 0xFF0000, 16),
-    "green": BitField("rgb", 0xFF00, 8),
-    "blue": BitField("rgb", 0xFF),
-}
+_PACKED = ("rgb", "rgba")
+"""Fields that hold a colour in 4 bytes; some writers call them floats."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +54,7 @@ class PcdScan:
             records = np.empty(len(stored), dtype=dtype)
             for name in dtype.names or ():
                 values = stored[name]
-                is_packed = name == "rgb" and values.dtype.kind == "f"
+                is_packed = name in _PACKED and values.dtype.kind == "f"
                 records[name] = np.ascontiguousarray(values).view("<u4") if is_packed else values
             coordinates = np.stack([records[a].astype(np.float64) for a in "xyz"], axis=1)
             yield Block(records, coordinates)
@@ -117,13 +114,27 @@ class PcdScan:
         return records
 
 
+def _colours_of(stored: np.dtype[np.void]) -> dict[str, BitField]:
+    """Return where the parts of a packed colour sit."""
+    packed = [n for n in _PACKED if n in (stored.names or ()) and stored[n].itemsize == 4]
+    if not packed:
+        return {}
+    name = packed[0]
+    bits = {
+        "red": BitField(name, 0xFF0000, 16),
+        "green": BitField(name, 0xFF00, 8),
+        "blue": BitField(name, 0xFF),
+    }
+    return bits | ({"alpha": BitField(name, 0xFF000000, 24)} if name == "rgba" else {})
+
+
 def _useful(stored: np.dtype[np.void]) -> np.dtype[np.void]:
     fields: list[tuple[str, Any]] = []
     for name in stored.names or ():
         kind = stored[name]
         if name.startswith("_"):
             continue
-        fields.append((name, "<u4" if name == "rgb" and kind.itemsize == 4 else kind))
+        fields.append((name, "<u4" if name in _PACKED and kind.itemsize == 4 else kind))
     return np.dtype(fields)
 
 
@@ -186,7 +197,7 @@ def _scan(path: Path, lines: dict[str, tuple[str, ...]], start: int) -> PcdScan:
         msg = f"{path.name} has points without x, y and z; its fields are {', '.join(names)}."
         raise FormatError(msg)
     refuse_empty(total, path)
-    bits = dict(_RGB) if "rgb" in names and stored["rgb"].itemsize == 4 else {}
+    bits = _colours_of(stored)
     notes: tuple[str, ...] = ()
     if lines.get("VIEWPOINT", ("0", "0", "0", "1", "0", "0", "0"))[:7] != tuple("0001000"):
         notes = ("names a viewpoint, which is kept out of the coordinates.",)
