@@ -158,3 +158,23 @@ def test_an_error_names_the_folder_that_the_user_named(tmp_path):
         job()
     assert str(tmp_path / "result" / "a.laz") in str(caught.value)
     assert ".part-" not in str(caught.value)
+
+
+def test_clouds_of_an_earlier_result_do_not_stay_beside_the_new_ones(tmp_path):
+    """A pose of last week's run would pass for one of today's."""
+    out = tmp_path / "result"
+
+    def result(*names):
+        with outputs.result_folder(out) as part:
+            for name in names:
+                for folder, suffix in (("clouds", "laz"), ("registrations", "json")):
+                    (part / folder).mkdir(exist_ok=True)
+                    (part / folder / f"{name}.{suffix}").write_text(name)
+            document = {"clouds": [{"name": name} for name in names]}
+            outputs.write_json(part / "result.json", document)
+
+    result("scan", "tower.v2")
+    (out / "clouds" / "mine.txt").write_text("notes")
+    result("scan")
+    found = sorted(str(p.relative_to(out)) for p in out.rglob("*") if p.is_file())
+    assert found == ["clouds/mine.txt", "clouds/scan.laz", "registrations/scan.json", "result.json"]

@@ -125,8 +125,9 @@ def _refuse_second_writer(out: Path) -> None:
 def result_folder(out: Path) -> Iterator[Path]:
     """Yield an empty folder beside `out`; its files move into `out` when the block succeeds.
 
-    Files in `out` that the job does not write stay as they are. On any failure the folder is
-    removed and `out` is untouched.
+    Clouds and registrations of an earlier result in `out` go, since beside the new ones they would
+    pass for a part of it; other files that the job does not write stay as they are. On any failure
+    the folder is removed and `out` is untouched.
 
     Raises
     ------
@@ -161,10 +162,29 @@ def _move_into(part: Path, out: Path) -> None:
         if not out.exists():
             part.rename(out)
             return
+        old = _clouds_of_earlier_result(out)
         for file in sorted(path for path in part.rglob("*") if path.is_file()):
             target = out / file.relative_to(part)
             target.parent.mkdir(parents=True, exist_ok=True)
             file.replace(target)
+            old.discard(target)
+        for file in old:
+            file.unlink()
     except OSError as error:
         msg = f"{out} could not be written: {error.strerror or error}."
         raise OutputError(msg) from error
+
+
+_OF_CLOUDS = ("clouds", "registrations", "removed")
+"""Folders of a result that hold files named after its clouds."""
+
+
+def _clouds_of_earlier_result(out: Path) -> set[Path]:
+    """Return the files in `out` that the result.json there calls its clouds' own."""
+    try:
+        clouds = json.loads((out / "result.json").read_text(encoding="utf-8"))["clouds"]
+        starts = tuple(f"{cloud['name']}." for cloud in clouds)
+    except (OSError, ValueError, KeyError, TypeError):
+        return set()  # no result, or none of ours: nothing in the folder is known
+    files = (path for folder in _OF_CLOUDS for path in (out / folder).glob("*"))
+    return {path for path in files if path.is_file() and path.name.startswith(starts)}
