@@ -20,7 +20,7 @@ from dougong.errors import InputError
 from dougong.formats import write
 from dougong.pipeline.pairs import read_pairs
 from dougong.report.figures import find_place
-from dougong.report.layers import BLUE, COLOURS, Layer, Removed
+from dougong.report.layers import BLUE, COLOURS, Cores, Layer, Removed
 from dougong.report.looks import look_at
 from dougong.report.model import from_run
 from dougong.report.payload import (
@@ -32,6 +32,7 @@ from dougong.report.payload import (
     distances,
     pack,
     shares,
+    signed_distances,
     size_codes,
     sizes,
     thinned,
@@ -373,3 +374,16 @@ def test_removed_points_ride_with_their_cloud(layers):
     assert np.abs(np.sort(unpacked(packed)[0], 0) - np.sort(BEACONS, 0)).max() <= STEP_M / 2 + 1e-9
     assert "2 points that the filters took out" in view.lead
     assert "reason" not in view_3d(layers, find_place(layers)).scene["colours"]
+
+
+@pytest.mark.skipif(why_missing() is not None, reason=f"no viewer: {why_missing()}")
+def test_measured_distances_are_shown_signed(layers):
+    core = layers[0].after[::7]
+    cores = Cores(after=core, distance_m=np.where(core[:, 2] > 1, 0.02, -0.01), reach_m=0.05)
+    found = signed_distances(np.vstack([core[:50], [[90.0, 0, 0]]]), [cores])
+    assert (found[:50] == cores.distance_m[:50]).all()
+    assert np.isnan(found[50])
+    scene = view_3d([replace(layers[0], cores=cores), layers[1]], find_place(layers)).scene
+    assert scene["residual"]["is_signed"]
+    assert scene["residual"]["shown_m"] == pytest.approx(0.02)
+    assert not view_3d(layers, find_place(layers)).scene["residual"]["is_signed"]

@@ -1,6 +1,6 @@
 """The clouds of a result folder as layers of a picture: thinned, in one frame, with a colour."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong.cloud import Cloud
-from dougong.formats import iterate
+from dougong.formats import iterate, read
 from dougong.typing import Points, Transform, Values
 
 MAX_POINTS = 700_000
 """Points of one layer that are drawn."""
+_TAKEN_FROM = 1.5
+"""Core spacings within which a point takes the distance of a core point."""
 
 # Okabe and Ito (2008), told apart with every common colour vision, in an order of their own:
 # the reference is blue, the first cloud that moved is orange.
@@ -29,6 +31,18 @@ class Removed:
     """(k, 3) as `Layer.after`."""
     reasons: NDArray[np.uint8]
     """(k,) `dougong.filters.selection.Reason`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cores:
+    """Core points of a registration with their signed distances (M3C2)."""
+
+    after: Points
+    """(k, 3) as `Layer.after`."""
+    distance_m: Values
+    """(k,) the cloud minus the reference, along the outward normal."""
+    reach_m: float
+    """A point within this of a core point takes its distance."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +66,8 @@ class Layer:
     classes: NDArray[np.uint8] | None = None
     """(n,) LAS classes."""
     removed: Removed | None = None
+    cores: Cores | None = None
+    """What this cloud's registration leaves, where it was measured."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,7 +160,7 @@ def rigid_inverse(matrix: Transform, origin: Values) -> tuple[Transform, Values]
 
 def run_layers(folder: Path, result: dict[str, Any]) -> list[Layer]:
     """Return the layers of a run: its filtered clouds, the reference last."""
-    matrices = {entry["source"]: entry["matrix"] for entry in result["registrations"]}
+    links = {entry["source"]: entry for entry in result["registrations"]}
     layers = []
     common: Values | None = None
     entries = sorted(result["clouds"], key=lambda cloud: cloud["name"] != result["reference"])
@@ -158,7 +174,7 @@ def run_layers(folder: Path, result: dict[str, Any]) -> list[Layer]:
         is_sure = is_reference or name in result["merged"]["clouds"]
         before, after = xyz, xyz + (origin - common)
         taken = _removed(folder, entry, common)
-        matrix = None if is_reference else matrices[name]
+        matrix = None if is_reference else links[name]["matrix"]
         if matrix is not None and is_sure:
             before = _taken_back(xyz, origin, np.array(matrix))
         elif matrix is not None:
@@ -168,6 +184,7 @@ def run_layers(folder: Path, result: dict[str, Any]) -> list[Layer]:
             Layer(
                 name=name,
                 removed=taken,
+                cores=None if is_reference else cores_of(folder, links[name], common),
                 colour=BLUE if is_reference else next(colours),
                 after=after,
                 before=before,
@@ -180,6 +197,32 @@ def run_layers(folder: Path, result: dict[str, Any]) -> list[Layer]:
             )
         )
     return layers[1:] + layers[:1]
+
+
+def cores_of(folder: Path, document: Mapping[str, Any], common: Values) -> Cores | None:
+    """Return the core points of a registration in a result folder, about `common`, if there are.
+
+    Parameters
+    ----------
+    folder : Path
+    document : mapping
+        The registration, as `registration.json` has it.
+    common : ndarray, shape (3,)
+    """
+    told = document.get("distances") or {}
+    path = folder / str(told.get("file", ""))
+    if not told or not path.is_file():
+        return None
+    cloud = read(path)
+    found = cloud.attribute("m3c2_distance")
+    if found is None:
+        return None
+    is_known = np.isfinite(found)
+    return Cores(
+        after=(cloud.xyz + (cloud.frame.origin - common))[is_known],
+        distance_m=found[is_known].astype(np.float64),
+        reach_m=_TAKEN_FROM * float(told["scales"]["core_spacing_m"]),
+    )
 
 
 def _removed(folder: Path, entry: dict[str, Any], common: Values) -> Removed | None:
@@ -211,8 +254,11 @@ def _taken_back(xyz: Points, origin: Values, matrix: Transform) -> Points:
     return own + (shift - np.floor(shift))
 
 
-def pair_layers(document: dict[str, Any]) -> list[Layer]:
-    """Return the layers of a single registration, from its input files; none if they are gone."""
+def pair_layers(document: dict[str, Any], folder: Path | None = None) -> list[Layer]:
+    """Return the layers of a single registration, from its input files; none if they are gone.
+
+    `folder` is where the registration's own files are: its distances are shown with it.
+    """
     source, target = document["inputs"]
     paths = [Path(source["path"]), Path(target["path"])]
     if not all(path.is_file() for path in paths):
@@ -247,6 +293,7 @@ def pair_layers(document: dict[str, Any]) -> list[Layer]:
         is_reference=False,
         is_sure=document["status"] == "ok",
         is_placed=document["matrix"] is not None,
+        cores=None if folder is None else cores_of(folder, document, common),
         origin=common,
         colours=first_read.colours,
         classes=first_read.classes,

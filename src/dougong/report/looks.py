@@ -13,7 +13,7 @@ from dougong.report.plates import round_length
 RESIDUALS = ("m3c2_distance", "M3C2 distance", "m3c2_signed_distance")
 """Attributes that hold signed distances (metres) to the other clouds, the first found counts."""
 SIGNED_TITLE = "signed distance along the normals (M3C2)"
-SIGNED_WORDS = "+ outside, − inside the other cloud's surface"
+SIGNED_WORDS = "+ where the registered cloud stands outside the reference, − inside"
 _SAMPLE = 100_000
 _UNCLASSIFIED = {0, 1}
 

@@ -9,13 +9,14 @@ About 8 bytes a point.
 
 import base64
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.report.layers import Layer
+from dougong.report.layers import Cores, Layer
 from dougong.typing import Points, Transform, Values
 
 MAX_POINTS = 400_000
@@ -125,6 +126,25 @@ def distances(points: Points, others: Points) -> Values:
     normal = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
     found: Values = np.abs(np.einsum("ni,ni->n", points - middle, normal))
     found[near[:, 0] > REACH_M] = np.nan
+    return found
+
+
+def signed_distances(points: Points, cores: Sequence[Cores]) -> Values:
+    """Return the signed distance (n,) at each point (n, 3): that of the nearest core point.
+
+    Metres; NaN where no core point is in reach.
+    """
+    from scipy.spatial import cKDTree
+
+    found = np.full(len(points), np.nan)
+    nearest = np.full(len(points), np.inf)
+    for core in cores:
+        if not len(core.after):
+            continue
+        away, place = cKDTree(core.after).query(points, workers=-1)
+        is_nearer = (away <= core.reach_m) & (away < nearest)
+        nearest[is_nearer] = away[is_nearer]
+        found[is_nearer] = core.distance_m[place[is_nearer]]
     return found
 
 

@@ -35,7 +35,7 @@ def build(folder: Path) -> Path:
         report = from_run(document, load(demo) if demo.is_file() else None)
     elif single.is_file():
         document = load(single)
-        layers = pair_layers(document)
+        layers = pair_layers(document, folder)
         report = from_registration(document)
         if not layers:
             note = "The input files are not where they were, so nothing could be drawn."

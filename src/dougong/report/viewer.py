@@ -9,7 +9,7 @@ import numpy as np
 
 from dougong.report.figures import Place
 from dougong.report.layers import Layer, Removed
-from dougong.report.looks import scale_end
+from dougong.report.looks import SIGNED_TITLE, SIGNED_WORDS, scale_end
 from dougong.report.payload import (
     MAX_POINTS,
     REACH_M,
@@ -19,8 +19,10 @@ from dougong.report.payload import (
     distances,
     pack,
     shares,
+    signed_distances,
     thinned,
 )
+from dougong.typing import Points, Values
 
 STATIC = Path(__file__).parent / "static"
 _EYE_M = 1.5
@@ -72,8 +74,7 @@ def view_3d(layers: list[Layer], place: Place, static: Path = STATIC) -> View3D:
     packed, found_all = [], []
     for index, (layer, most, out) in enumerate(zip(shown, allowed, taken, strict=True)):
         chosen = thinned(layer.after, most)
-        others = [other.after for other in shown if other is not layer]
-        found = distances(layer.after[chosen], np.concatenate(others)) if others else None
+        found = _distances_of(layer.after[chosen], layer, shown)
         if found is not None:
             found_all.append(found[~np.isnan(found)])
         packed.append(
@@ -95,6 +96,17 @@ def view_3d(layers: list[Layer], place: Place, static: Path = STATIC) -> View3D:
         style=(static / "viewer.css").read_text(encoding="utf-8"),
         lead=_lead(shown, packed),
     )
+
+
+def _distances_of(points: Points, layer: Layer, shown: list[Layer]) -> Values | None:
+    """Return the distance (n,) to show at some points of a layer: signed where it was measured."""
+    measured = [other for other in shown if other.cores is not None]
+    if measured:
+        # At the reference any registration counts, at another cloud its own.
+        own = measured if layer.is_reference else [other for other in measured if other is layer]
+        return signed_distances(points, [other.cores for other in own if other.cores is not None])
+    others = [other.after for other in shown if other is not layer]
+    return distances(points, np.concatenate(others)) if others else None
 
 
 def _packed_removed(removed: Removed, most: int, index: int) -> Packed:
@@ -142,13 +154,20 @@ def _scene(
         "classes": present,
         "precision_m": STEP_M / 2,
         "reasons": reasons,
-        "residual": {
-            "shown_m": scale_end(near),
-            "reach_m": REACH_M,
-            "code_max_m": REACH_M,
-            "is_signed": False,
-            "title": "distance to the other cloud",
-        },
+        "residual": _residual(shown, scale_end(near)),
+    }
+
+
+def _residual(shown: list[Layer], end_m: float) -> dict[str, Any]:
+    """Return how distances are drawn and named."""
+    is_signed = any(layer.cores is not None for layer in shown)
+    return {
+        "shown_m": end_m,
+        "reach_m": None if is_signed else REACH_M,
+        "code_max_m": REACH_M,
+        "is_signed": is_signed,
+        "title": SIGNED_TITLE if is_signed else "distance to the other cloud",
+        "signs": SIGNED_WORDS if is_signed else None,
     }
 
 
@@ -209,7 +228,12 @@ def _lead(shown: list[Layer], packed: list[Packed]) -> str:
         text += (
             "As delivered: every cloud in its own axes, set down about one middle and not turned. "
         )
-    if len(shown) > 1:
+    if any(layer.cores is not None for layer in shown):
+        text += (
+            "Distance: signed, along the surface's normal, of the nearest core point (M3C2); "
+            f"{SIGNED_WORDS}. "
+        )
+    elif len(shown) > 1:
         text += (
             "Distance: from a point to the plane through the 8 nearest points of the other clouds. "
         )
