@@ -184,9 +184,10 @@ def full_notes(document: Mapping[str, Any] | None) -> list[str]:
     if document is None:
         return []
     said = [f"{file['file']}: {note}" for file in document["files"] for note in file["notes"]]
-    said += [
-        f"{Path(left['file']).name}: {left['cloud']} is not written at full resolution, as its "
-        f"registration is {left['status']}"
-        for left in document["left_out"]
-    ]
+    for left in document["left_out"]:
+        why = "failed" if left["status"] == "failed" else f"is {left['status']}"
+        said.append(
+            f"{Path(left['file']).name}: {left['cloud']} is not written at full resolution, as its "
+            f"registration {why}"
+        )
     return said
