@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dougong.cloud import BitField, Cloud, Frame
+from dougong.cloud import BitField, Cloud, Frame, chosen_rows
 from dougong.errors import InputError
 
 
@@ -31,6 +31,15 @@ def test_select_by_mask_and_by_index_agree_and_take_the_records_along():
     assert by_mask.attribute("tag").tolist() == [0, 3, 6, 9]
     assert np.array_equal(by_mask.xyz, by_index.xyz)
     assert np.array_equal(by_mask.records, by_index.records)
+
+
+def test_rows_are_chosen_as_numpy_chooses_them():
+    records = np.random.default_rng(0).integers(0, 256, (50, 13), dtype=np.uint8)
+    records = records.reshape(-1).view([("a", "<f4"), ("b", "V3"), ("c", "<u2", (3,))])
+    for chosen in (np.array([3, 3, -1, 0]), np.arange(50) % 2 == 0, np.arange(0)):
+        assert chosen_rows(records, chosen).tobytes() == records[chosen].tobytes()
+    with pytest.raises(InputError, match="one value per point, got 49 for 50"):
+        chosen_rows(records, np.ones(49, dtype=bool))
 
 
 def test_packed_attributes_are_set_without_touching_their_neighbours():

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.cloud import Records
+from dougong.cloud import Records, chosen_rows
 from dougong.formats.atomic import Sink
 from dougong.formats.las_header import POINT_FORMATS, LasHeader, Vlr
 from dougong.formats.las_write import Totals, as_bytes, head_bytes, write_evlrs
@@ -180,10 +180,11 @@ def _write_nodes(
     encoder.reserve_offset_to_chunk_table()
     count = len(nodes.level)
     for first in range(0, count, _NODES_AT_ONCE):
-        stops = range(first, min(first + _NODES_AT_ONCE, count))
-        encoder.compress_chunks(
-            [as_bytes(records[nodes.order[nodes.starts[i] : nodes.starts[i + 1]]]) for i in stops]
-        )
+        places = [
+            nodes.order[nodes.starts[i] : nodes.starts[i + 1]]
+            for i in range(first, min(first + _NODES_AT_ONCE, count))
+        ]
+        encoder.compress_chunks([as_bytes(chosen_rows(records, place)) for place in places])
     encoder.done()
     sink.flush()
     sink.seek(points_start)

@@ -16,7 +16,7 @@ from typing import IO, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.cloud import BitField, Cloud, Frame, Records
+from dougong.cloud import BitField, Cloud, Frame, Records, chosen_rows
 from dougong.errors import FormatError
 from dougong.formats.units import units_of
 from dougong.typing import Mask, Points
@@ -290,6 +290,13 @@ def read_scans(scans: list[Scan], rows: int) -> list[Cloud]:
     ]
 
 
+def _good(block: Block, is_ok: Mask) -> tuple[Records, Points]:
+    """Return the records and coordinates of the good rows."""
+    if is_ok.all():
+        return block.records, block.coordinates
+    return chosen_rows(block.records, is_ok), block.coordinates[is_ok]
+
+
 class _Room:
     """Where the good rows of a scan are gathered: at their final place if their count is known."""
 
@@ -303,8 +310,7 @@ class _Room:
         self._filled = 0
 
     def add(self, block: Block, is_ok: Mask) -> None:
-        chosen = slice(None) if is_ok.all() else is_ok
-        records, coordinates = block.records[chosen], block.coordinates[chosen]
+        records, coordinates = _good(block, is_ok)
         if not self._fits:
             self._records.append(records)
             self._coordinates.append(coordinates)
@@ -343,6 +349,5 @@ def iterate_scans(scans: list[Scan], rows: int, survey: Survey | None = None) ->
         for block in scan.blocks(rows):
             is_ok = Survey().count(block)
             if is_ok.any():
-                chosen = slice(None) if is_ok.all() else is_ok
-                yield _make(scan, lattice, block.records[chosen], block.coordinates[chosen], notes)
+                yield _make(scan, lattice, *_good(block, is_ok), notes)
                 notes = ()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.cloud import Cloud
+from dougong.cloud import Cloud, chosen_rows
 from dougong.errors import InputError
 from dougong.filters.cloth_simulation import ClothSimulation, cloth_simulation
 from dougong.filters.curvature_weighted import CurvatureWeighted, curvature_weighted
@@ -151,7 +151,9 @@ def run_octree_voxel_grid(bench: Bench, params: OctreeVoxelGrid) -> None:
     chosen = bench.apply(
         "octree_voxel_grid",
         Reason.DECIMATED,
-        lambda index: octree_voxel_grid(cloud.xyz[index], params, records=cloud.records[index]),
+        lambda index: octree_voxel_grid(
+            cloud.xyz[index], params, records=chosen_rows(cloud.records, index)
+        ),
     )
     bench.voxel_count = np.zeros(len(cloud), dtype=np.int32)
     bench.voxel_count[left] = chosen.attributes["voxel_count"]

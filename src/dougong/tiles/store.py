@@ -12,7 +12,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from dougong.cloud import Records
+from dougong.cloud import Records, chosen_rows
 from dougong.errors import OutputError
 from dougong.typing import Index, Points
 
@@ -31,7 +31,7 @@ class Rows(NamedTuple):
 
     def take(self, chosen: Any) -> "Rows":
         """Return the `chosen` of them: a mask or places."""
-        return Rows(self.row[chosen], self.xyz[chosen], self.records[chosen])
+        return Rows(self.row[chosen], self.xyz[chosen], chosen_rows(self.records, chosen))
 
 
 class RowFile:
