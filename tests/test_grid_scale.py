@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from pyproj import CRS, Proj, Transformer
 from scipy.spatial.transform import Rotation
 
@@ -122,6 +123,13 @@ def test_clouds_of_one_map_have_no_factor_between_them():
     assert "taken to be in the same one" in said
 
 
+def test_a_site_grid_and_a_scanner_frame_may_hold_the_same_small_numbers():
+    site = "+proj=tmerc +lat_0=35 +lon_0=116 +k=1 +x_0=0 +y_0=0 +ellps=GRS80 +type=crs"
+    drone = on((0, 0, 3000.0), "drone", as_wkt(site))
+    pair, _ = decided(on((0, 0, 0), "scan", None, 1), drone)
+    assert 1e6 * (pair.factor - 1.0) == pytest.approx(-473, abs=5)  # 3000 m of height
+
+
 def test_two_projections_have_the_ratio_of_their_factors():
     to_other = Transformer.from_crs(UTM, XIAN, always_xy=True)
     other = (*to_other.transform(*PLACE[:2]), PLACE[2])
@@ -162,6 +170,9 @@ def test_the_factor_can_be_given_and_switched_off():
     with pytest.raises(InputError, match=r"neither scan nor scan is in a map projection"):
         pair_on_ground(scan, scan, 0.99987)
     assert Register(grid_scale="0.9996").grid_scale == 0.9996
+    for wrong in ("foo", 1.5, "nan", True):
+        with pytest.raises(ValidationError, match=r"neither auto, off nor a factor between"):
+            Register(grid_scale=wrong)
 
 
 def test_the_pose_is_written_between_files_with_the_factor(monkeypatch):

@@ -154,7 +154,9 @@ def _is_one_map(source: Cloud, target: Cloud, one: GridScale | None, two: GridSc
             source.frame.crs or "", target.frame.crs or ""
         )
     plain, projected = (source, target) if one is None else (target, source)
-    return plain.frame.crs is None and _overlap_in_plan(plain, projected)
+    # Among small numbers a scanner's own frame meets a site's map by accident.
+    is_map = plain.frame.crs is None and _is_map_sized(plain)
+    return is_map and _overlap_in_plan(plain, projected)
 
 
 def _is_map_sized(cloud: Cloud) -> bool:

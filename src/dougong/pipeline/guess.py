@@ -143,4 +143,8 @@ _SETTINGS = (
     '# coarse = "auto"           # auto, plan, improved-pca, pca, sac-ia, 4pcs, none',
     '# fine = "point-to-plane"   # or point-to-point, none',
     '# dof = "auto"              # auto, 4 (levelled), 6 (rigid)',
+    '# grid_scale = "auto"       # "off": the map is a site-calibrated ground system',
+    "",
+    "[merge]",
+    '# mode = "best"             # per zone the better source; "all": every point',
 )

@@ -43,6 +43,8 @@ from dougong.typing import Kind, Transform
 
 Coarse = Literal["auto", "plan", "improved-pca", "pca", "sac-ia", "4pcs", "none"]
 _LISTED = 12
+_FACTORS = (0.9, 1.1)
+"""Combined factors of survey projections, with room to spare."""
 _LATER = {
     5: "dof 5 frees the scale, which is not built yet; use auto, 4 or 6",
     7: "dof 7 frees the scale, which is not built yet; use auto, 4 or 6",
@@ -62,7 +64,7 @@ class Register(Parameters):
     """The inputs are clean already: nothing is dropped before the search."""
     yaw_hint_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
     """Known turn from source to target about the vertical, within 15 degrees."""
-    grid_scale: Literal["auto", "off"] | Annotated[float, Field(gt=0.5, lt=2.0)] = "auto"
+    grid_scale: Literal["auto", "off"] | float = "auto"
     """Combined factor (grid / ground) of clouds in a map projection; auto: from their system and
     height; off: they are true to scale, as site-calibrated ground systems are."""
     accept_best: bool = False
@@ -73,6 +75,23 @@ class Register(Parameters):
     congruent_sets: CongruentSets = CongruentSets()
     icp: Icp = Icp()
     verdict: Verdict = Verdict()
+
+    @field_validator("grid_scale", mode="before")
+    @classmethod
+    def _is_a_factor_or_a_word(cls, value: object) -> object:
+        if value in ("auto", "off"):
+            return value
+        try:
+            factor = float(str(value))
+        except ValueError:
+            factor = float("nan")
+        if not _FACTORS[0] <= factor <= _FACTORS[1]:
+            msg = (
+                f"{value!r} is neither auto, off nor a factor between {_FACTORS[0]:g} and "
+                f"{_FACTORS[1]:g} (grid / ground, such as 0.9996)"
+            )
+            raise ValueError(msg)
+        return factor
 
     @field_validator("dof", mode="before")
     @classmethod
