@@ -61,8 +61,6 @@ def test_the_reference_is_the_first_photogrammetry_cloud_else_the_first_lidar(pr
         (GOOD + "[registr]\ncoarse='auto'", "'registr', did you mean 'register'"),
         (GOOD + "[register]\ndof=3", r"register\.dof"),
         (GOOD + "[filter.lidar.octree_voxel_grid]\nvoxel=1", "did you mean 'voxel_m'"),
-        (GOOD + "[quality]\ncontrol='c.csv'", "does not use control points"),
-        (GOOD + "[quality]\nrequired_level='LOA20'", "independent check points"),
         (GOOD.replace('"lidar"', '"lidar"\nscale_known = false'), "does not search the scale"),
         (GOOD + "[[", "no valid TOML"),
     ],

@@ -193,6 +193,7 @@ def register_files(
     memory_bytes: int | None,
     progress: Progress,
     pairs: Path | None = None,
+    control: Path | None = None,
 ) -> Document:
     """Register one file onto another and write registration.json and report.html into `out`.
 
@@ -206,6 +207,8 @@ def register_files(
         The sensors; guessed from the files where they are not given.
     pairs : Path, optional
         A CSV file of places picked in both clouds.
+    control : Path, optional
+        A CSV file of control and check points.
     """
     from dougong.pipeline import jobs
     from dougong.pipeline.outputs import refuse_existing, result_folder
@@ -224,6 +227,7 @@ def register_files(
             memory_bytes=memory_bytes,
             progress=progress,
             pairs=pairs,
+            control=control,
         )
         _build_report(part, progress)
     return document

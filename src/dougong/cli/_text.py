@@ -84,6 +84,8 @@ def registration(document: Mapping[str, Any]) -> str:
     lines += [f"  not observable: {direction['text']}" for direction in document["unobservable"]]
     if document.get("pairs"):
         lines.append(_pairs(document["pairs"]))
+    if document.get("checks"):
+        lines += _checks(document["checks"])
     return "\n".join(lines)
 
 
@@ -94,6 +96,27 @@ def _pairs(document: Mapping[str, Any]) -> str:
     key = "residual_m" if is_posed else "fit_residual_m"
     off = ", ".join(f"{row['name']} {millimetres(row[key])}" for row in rows)
     return f"  picked pairs, {'under this pose' if is_posed else 'under their own best fit'}: {off}"
+
+
+def _checks(document: Mapping[str, Any]) -> list[str]:
+    """Return what control and check points say, in lines."""
+    lines = []
+    if document["control_points"]:
+        used = [p for p in document["points"] if p["is_used"]]
+        off = ", ".join(f"{p['name']} {millimetres(p['residual_m'])}" for p in used)
+        lines.append(f"  control points: {off or 'none used'}")
+    lines += [
+        f"  control point {name} contradicts the others: left out" for name in document["bad"]
+    ]
+    check = document["check"]
+    if check is None:
+        return [*lines, f"  no level of accuracy: {document['why_no_level']}"]
+    grade = check["level"] or "coarser than LOA10"
+    return [
+        *lines,
+        f"  check RMSE {millimetres(check['check_rmse_m'])} at {check['points']} points, 95 % "
+        f"error at most {millimetres(check['upper95_m'])} (95 % confidence): {grade}",
+    ]
 
 
 def notes(document: Sequence[str]) -> str:

@@ -27,6 +27,7 @@ def command(
     filtered: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     yaw_hint: float | None = None,
     pairs: Path | None = None,
+    control: Path | None = None,
     grid_scale: str = "auto",
     accept_best: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
@@ -65,6 +66,9 @@ def command(
     pairs
         Places picked in both clouds with `dougong view SOURCE TARGET --pairs FILE`: their pose is
         one more for the proof to hear, and never ok by itself.
+    control
+        CSV file of places surveyed in both frames: control points are adjusted with the clouds by
+        their sigmas, check points are held out and give the error.
     grid_scale
         Combined factor (grid / ground) of a cloud in a map projection; auto: from its system and
         height; off: the map is true to scale, as site-calibrated ground systems are; or a number.
@@ -94,6 +98,7 @@ def command(
             memory_bytes=common.memory_bytes(),
             progress=progress,
             pairs=pairs,
+            control=control,
         )
         code = _EXIT[document["status"]]
         if accept_best and code == UNSURE:

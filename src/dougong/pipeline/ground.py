@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,12 @@ from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.formats import units_of
 from dougong.formats.projection import GridScale, grid_scale, is_in_use, is_same_plan
+from dougong.registration.control import ControlPoints
 from dougong.registration.picked_pairs import PickedPairs
 from dougong.registration.result import FineResult, Hypothesis, Registration
 from dougong.typing import Points, Transform, Values
 
+Places = TypeVar("Places", PickedPairs, ControlPoints)
 Setting = Literal["auto", "off"] | float
 NEGLIGIBLE_PPM = 10.0
 """1 mm in 100 m, what a good scanner's own scale is known to: such maps count as true to scale."""
@@ -68,12 +70,12 @@ class Pair:
         """Lengths in plan in the target / those in the source."""
         return self.target.factor / self.source.factor
 
-    def picked(self, pairs: PickedPairs) -> PickedPairs:
-        """Return places picked in the files, in ground metres."""
+    def on_ground(self, places: Places) -> Places:
+        """Return places known in the coordinates of both files, in ground metres."""
         return replace(
-            pairs,
-            source=pairs.source * self.source.to_ground,
-            target=pairs.target * self.target.to_ground,
+            places,
+            source=places.source * self.source.to_ground,
+            target=places.target * self.target.to_ground,
         )
 
 

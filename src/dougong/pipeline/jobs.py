@@ -23,6 +23,7 @@ from dougong.formats import (
     write,
 )
 from dougong.params import Parameters
+from dougong.pipeline.control import read_control, require_control_of
 from dougong.pipeline.distances import distances_document, measure, write_distances
 from dougong.pipeline.exports import Ends, write_registration
 from dougong.pipeline.guess import guess_kind
@@ -330,19 +331,23 @@ def register_files(
     memory_bytes: int | None,
     progress: Progress,
     pairs: Path | None = None,
+    control: Path | None = None,
 ) -> dict[str, Any]:
     """Register one file onto another; write ``registration.json`` into the folder `out`.
 
     Raises
     ------
     InputError
-        A setting or the file of picked pairs is wrong, or the job needs more memory than it may
-        use.
+        A setting, the file of picked pairs or the control file is wrong, or the job needs more
+        memory than it may use.
     FormatError, FrameError, RegistrationError
         The clouds cannot be read or combined.
     """
     params = validated(Register, options, "register")
     picked = None if pairs is None else read_pairs(pairs, stem(source))
+    surveyed = None
+    if control is not None:
+        surveyed = require_control_of(read_control(control), control, stem(source))
     refuse_too_large([source, target], memory_bytes)
     clouds: list[Cloud] = []
     kinds: list[Kind] = []
@@ -360,7 +365,13 @@ def register_files(
         notes += [f"{path.name}: {note}" for note in (*cloud.notes, *faults_of(cloud))]
     progress.stage(f"registering {source.name} onto {target.name}")
     result = register(
-        clouds[0], clouds[1], params, source_kind=kinds[0], target_kind=kinds[1], pairs=picked
+        clouds[0],
+        clouds[1],
+        params,
+        source_kind=kinds[0],
+        target_kind=kinds[1],
+        pairs=picked,
+        control=surveyed,
     )
     document = to_document(
         replace(result, notes=(*notes, *result.notes)),

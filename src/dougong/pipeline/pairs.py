@@ -73,7 +73,7 @@ def read_pairs(path: Path, source: str) -> PickedPairs:
     InputError
         The file cannot be read, a column is missing, a value is no number, or no row is left.
     """
-    rows = _rows(path)
+    rows = csv_rows(path)
     of_cloud = [row for row in rows if (row.get("cloud") or source) == source]
     if rows and not of_cloud:
         others = ", ".join(sorted({str(row.get("cloud")) for row in rows}))
@@ -83,7 +83,7 @@ def read_pairs(path: Path, source: str) -> PickedPairs:
         )
         raise InputError(msg)
     used = [row for row in of_cloud if (row.get("role") or "control").strip().lower() != "check"]
-    values = np.array([_numbers(path, number, row) for number, row in enumerate(used, 2)])
+    values = np.array([coordinates_in(path, number, row) for number, row in enumerate(used, 2)])
     values = values.reshape(-1, 6)
     return PickedPairs(
         names=tuple((row.get("name") or str(index)) for index, row in enumerate(used, 1)),
@@ -94,7 +94,14 @@ def read_pairs(path: Path, source: str) -> PickedPairs:
     )
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
+def csv_rows(path: Path, needed: Sequence[str] = COORDINATES) -> list[dict[str, str]]:
+    """Return the rows of a file with the columns of a control file, keys in lower case.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or one of the `needed` columns is missing.
+    """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -106,20 +113,44 @@ def _rows(path: Path) -> list[dict[str, str]]:
     reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
     named = [name.strip().lower() for name in reader.fieldnames or ()]
     reader.fieldnames = named
-    missing = [name for name in COORDINATES if name not in named]
+    missing = [name for name in needed if name not in named]
     if missing:
         msg = (
             f"{path.name} has no column {', '.join(missing)}; its first line is "
-            f"{','.join(named)[:80]!r}. Expected: {','.join(HEADER)} (name, cloud, sigma_m and "
-            "role may be left out), separated by commas."
+            f"{','.join(named)[:80]!r}. Expected: {','.join(HEADER)}"
+            f"{_may_lack(needed)}, separated by commas."
         )
         raise InputError(msg)
-    return [row for row in reader if any((value or "").strip() for value in row.values())]
+    rows = []
+    for row in reader:
+        if None in row:
+            msg = (
+                f"{path.name}, line {reader.line_num}: it has more values than the first line has "
+                "names. Write numbers with a decimal point, and values separated by commas."
+            )
+            raise InputError(msg)
+        if any((value or "").strip() for value in row.values()):
+            rows.append(row)
+    return rows
 
 
-def _numbers(path: Path, number: int, row: dict[str, str]) -> list[float]:
+def _may_lack(needed: Sequence[str]) -> str:
+    others = [name for name in HEADER if name not in needed]
+    return f" ({', '.join(others)} may be left out)" if others else ""
+
+
+def coordinates_in(
+    path: Path, number: int, row: dict[str, str], names: Sequence[str] = COORDINATES
+) -> list[float]:
+    """Return the numbers of the columns `names` of row `number` (the first is 2).
+
+    Raises
+    ------
+    InputError
+        One is no finite number.
+    """
     found = []
-    for name in COORDINATES:
+    for name in names:
         text = (row.get(name) or "").strip()
         try:
             value = float(text)

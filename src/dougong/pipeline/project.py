@@ -115,23 +115,11 @@ def read_project(path: Path) -> Project:
         msg = f"{path} is no valid TOML: {error}. Compare it with the output of `dougong init`."
         raise InputError(msg) from None
     project = validated(Project, values, str(path))
-    if project.quality.control is not None:
-        msg = (
-            f"{path}: quality.control is set, but this version does not use control points. "
-            "Remove the key; the result then states no grade of accuracy."
-        )
-        raise InputError(msg)
     unscaled = [entry.name for entry in project.cloud if not entry.scale_known]
     if unscaled:
         msg = (
             f"{path}: cloud {unscaled[0]!r} has scale_known = false, but this version does not "
             "search the scale. Scale the cloud to metres first and remove the key."
-        )
-        raise InputError(msg)
-    if project.quality.required_level is not None:
-        msg = (
-            f"{path}: quality.required_level is set, but a level of accuracy needs independent "
-            "check points, which this version does not use. Remove the key."
         )
         raise InputError(msg)
     return project

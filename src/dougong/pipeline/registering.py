@@ -13,6 +13,7 @@ from dougong.pipeline.axes import mirrored_axes, upside_down
 from dougong.pipeline.ground import pair_on_ground, to_file
 from dougong.registration import Register
 from dougong.registration import register as search
+from dougong.registration.control import ControlPoints
 from dougong.registration.picked_pairs import PickedPairs
 from dougong.registration.result import Registration
 from dougong.typing import Kind
@@ -30,6 +31,7 @@ def register(
     source_kind: Kind = "lidar",
     target_kind: Kind = "photogrammetry",
     pairs: PickedPairs | None = None,
+    control: ControlPoints | None = None,
 ) -> Registration:
     """Find the motion from `source`'s file coordinates to `target`'s, and say how sure it is.
 
@@ -42,6 +44,8 @@ def register(
         What a sensor can and cannot see decides what counts as a contradiction.
     pairs : PickedPairs, optional
         Places picked in both clouds, in file coordinates: one more pose for the proof to hear.
+    control : ControlPoints, optional
+        Places surveyed in both frames, in file coordinates: adjusted with the clouds or held out.
 
     Returns
     -------
@@ -73,8 +77,17 @@ def register(
     pair, notes = pair_on_ground(one, two, params.grid_scale)
     if pair is not None:
         one, two = pair.source.cloud, pair.target.cloud
-        pairs = None if pairs is None else pair.picked(pairs)
-    result = search(one, two, params, source_kind=source_kind, target_kind=target_kind, pairs=pairs)
+        pairs = None if pairs is None else pair.on_ground(pairs)
+        control = None if control is None else pair.on_ground(control)
+    result = search(
+        one,
+        two,
+        params,
+        source_kind=source_kind,
+        target_kind=target_kind,
+        pairs=pairs,
+        control=control,
+    )
     if result.status == "failed" and params.coarse in ("auto", "plan"):
         turned = upside_down(one, two, result, params, source_kind, target_kind)
         result = result if turned is None else replace(result, reason=turned)

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,6 +13,11 @@ import numpy as np
 from dougong.cloud import Cloud
 from dougong.filters.selection import Reason
 from dougong.formats import write, write_merged
+from dougong.pipeline.control import (
+    control_of,
+    control_of_project,
+    quality_document,
+)
 from dougong.pipeline.distances import (
     Measured,
     distances_document,
@@ -33,6 +38,7 @@ from dougong.pipeline.registering import register
 from dougong.pipeline.registrations import finite, to_document
 from dougong.pipeline.store import Store
 from dougong.registration import Register
+from dougong.registration.control import ControlPoints
 from dougong.registration.result import Registration
 from dougong.typing import Transform
 
@@ -117,10 +123,11 @@ def run(
         shown=shown,
         room=room or Room.of(None),
     )
+    control = control_of_project(project, folder)
     movers = [mover for entry in project.cloud for mover in loader.movers(entry)]
     reference = next(mover for mover in movers if mover.entry == project.reference())
     with clock.measure("register"):
-        linked = _register_all(movers, reference, project.registration, progress)
+        linked = _register_all(movers, reference, project.registration, control, progress)
     with clock.measure("distances"):
         linked = [_measured(link, reference, progress) for link in linked]
     documents = _registration_documents(linked, reference, loader)
@@ -143,9 +150,11 @@ def run(
                 progress=progress,
             )
     statuses = [document["status"] for document in documents] or ["ok"]
+    quality = quality_document(project.quality.required_level, documents)
     result: dict[str, Any] = {
         "status": min(statuses, key=_WORST.index),
-        "is_settled": all(link.is_sure for link in linked),
+        "is_settled": all(link.is_sure for link in linked) and quality["is_reached"] is not False,
+        "quality": quality,
         "project": project.project.name,
         "reference": reference.name,
         "clouds": [_cloud_document(link, loader) for link in linked],
@@ -213,7 +222,11 @@ def _parameters(project: Project, shown: Callable[[Path], str]) -> dict[str, Any
 
 
 def _register_all(
-    movers: Sequence[Mover], reference: Mover, params: Register, progress: Progress
+    movers: Sequence[Mover],
+    reference: Mover,
+    params: Register,
+    control: Mapping[str, ControlPoints],
+    progress: Progress,
 ) -> list[Linked]:
     target = reference.joined()
     params = params.model_copy(update={"filtered": True})
@@ -229,6 +242,7 @@ def _register_all(
             params,
             source_kind=mover.kind,
             target_kind=reference.kind,
+            control=control_of(control, mover.name, mover.entry),
         )
         progress.note(f"{mover.name} -> {reference.name}: {result.status}. {result.reason}")
         linked.append(Linked(mover=mover, result=result, accepts_best=params.accept_best))

@@ -17,7 +17,6 @@ def registration_to_json(
     target: str,
     target_frame: Frame,
     inputs: Sequence[Mapping[str, Any]] = (),
-    checks: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the document of one registration, ready for ``json.dumps``.
 
@@ -31,8 +30,6 @@ def registration_to_json(
         coordinates.
     inputs : sequence of mappings
         {"path", "sha256", "points"} of each input file.
-    checks : mapping, optional
-        What control and check points said; None when there were none.
     """
     fine = result.fine
     is_known = fine is not None and result.status != "failed"
@@ -71,7 +68,7 @@ def registration_to_json(
             else None
         ),
         "unobservable": [dict(item) for item in fine.unobservable] if fine is not None else [],
-        "checks": None if checks is None else dict(checks),
+        "checks": None if result.checks is None else dict(result.checks),
         "pairs": None if result.pairs is None else dict(result.pairs),
         "notes": list(result.notes),
         "seconds": dict(result.seconds),

@@ -16,6 +16,15 @@ from dougong.errors import FrameError
 from dougong.params import Parameters
 from dougong.registration import hypotheses as ranking
 from dougong.registration.congruent_sets import CongruentSets, four_pcs
+from dougong.registration.control import (
+    Adjusted,
+    Control,
+    ControlPoints,
+    adjust,
+    checks_document,
+    local_control,
+    weigh_control,
+)
 from dougong.registration.covariance import displacement95
 from dougong.registration.evidence import Court, hear, summon
 from dougong.registration.handedness import LEFT_SENTENCE, handedness
@@ -124,6 +133,7 @@ def register(
     source_kind: Kind = "lidar",
     target_kind: Kind = "photogrammetry",
     pairs: PickedPairs | None = None,
+    control: ControlPoints | None = None,
 ) -> Registration:
     """Find the motion from `source`'s file coordinates to `target`'s, and say how sure it is.
 
@@ -136,6 +146,8 @@ def register(
         What a sensor can and cannot see decides what counts as a contradiction.
     pairs : PickedPairs, optional
         Places that a person picked in both: their pose is heard beside those of the search.
+    control : ControlPoints, optional
+        Places surveyed in both frames: adjusted together with the clouds, or held out as checks.
 
     Returns
     -------
@@ -147,7 +159,7 @@ def register(
     FrameError
         Heights and plan of a file have different units.
     InputError
-        The pairs fix no pose, or do not belong to these clouds.
+        The pairs fix no pose, or they or the control points do not belong to these clouds.
     RegistrationError
         A cloud has too few points, or is not levelled.
 
@@ -162,9 +174,16 @@ def register(
     if fit is not None and level is not None:
         cloud, own, matrix = level
         straight = register(
-            cloud, target, params, source_kind=source_kind, target_kind=target_kind, pairs=own
+            cloud,
+            target,
+            params,
+            source_kind=source_kind,
+            target_kind=target_kind,
+            pairs=own,
+            control=None if control is None else control.moved(matrix),
         )
         return from_levelled(straight, fit, matrix, source.name)
+    surveyed = None if control is None else local_control(control, source, target)
     scale = _unit_of(source) / _unit_of(target)
     proposal = propose_scale(source, target)
     if proposal is not None:
@@ -180,9 +199,11 @@ def register(
     picked = [] if fit is None else _picked(fit, one, two)
     is_searched = fit is None or params.coarse != "none"
     starts = coarse_poses(one, two, source.frame, target.frame, params) if is_searched else []
+    if surveyed is not None and surveyed.T_target_source is not None:
+        starts = [_heard(surveyed.T_target_source, "control", one, two), *starts]
     starts = [*picked, *starts]
     clock.lap("coarse")
-    found = decide(one, two, starts, params, clock)
+    found = decide(one, two, starts, params, clock, surveyed)
     is_judged = found.status == "ok" or found.reason == LEFT_SENTENCE
     if not is_judged and params.coarse in ("auto", "plan"):
         # Nothing was found to reflect: the mirror image is searched for from the start.
@@ -193,14 +214,18 @@ def register(
         status, reason = weigh(found.status, found.reason, found.T, fit, found.ruling)
         found = replace(found, status=status, reason=reason)
     result = _in_file_coordinates(found, source, target, scale, params, clock, notes)
+    if surveyed is not None:
+        result = replace(result, checks=checks_document(surveyed, found.adjusted, found.T))
     return result if fit is None else with_pairs(result, fit)
 
 
 def _picked(fit: PairFit, source: Prepared, target: Prepared) -> list[Hypothesis]:
-    return [
-        Hypothesis(T_target_source=T, score=ranking.score(T, source, target), method="pairs")
-        for T in starts_of(fit)
-    ]
+    return [_heard(T, "pairs", source, target) for T in starts_of(fit)]
+
+
+def _heard(T: Transform, method: str, source: Prepared, target: Prepared) -> Hypothesis:
+    """Return a pose that no search found, scored as theirs are."""
+    return Hypothesis(T_target_source=T, score=ranking.score(T, source, target), method=method)
 
 
 def coarse_poses(
@@ -210,8 +235,7 @@ def coarse_poses(
     if params.coarse == "none":
         T = np.eye(4)
         T[:3, 3] = source_frame.origin - target_frame.origin
-        given = Hypothesis(T_target_source=T, score=ranking.score(T, source, target), method="none")
-        return [given]
+        return [_heard(T, "none", source, target)]
     if params.coarse == "improved-pca":
         return list(improved_pca(source, target))
     if params.coarse == "pca":
@@ -236,6 +260,8 @@ class Found:
     hypotheses: tuple[Hypothesis, ...]
     margin: float
     ruling: Ruling | None
+    adjusted: Adjusted | None = None
+    """With the control points; None: there are none, or they changed nothing."""
 
 
 def decide(
@@ -244,6 +270,7 @@ def decide(
     starts: Sequence[Hypothesis],
     params: Register,
     clock: _Clock | None = None,
+    control: Control | None = None,
 ) -> Found:
     """Refine, compare and judge the starting poses; local frames."""
     clock = clock or _Clock()
@@ -265,7 +292,10 @@ def decide(
         [h.T_target_source for h in starts],
         quick,
         params.verdict,
-        lambda T: hint is None or _is_near_yaw(T, hint, reach),
+        lambda T: (
+            (hint is None or _is_near_yaw(T, hint, reach))
+            and (control is None or control.allows(T))
+        ),
     )
     clock.lap("proof")
     fine, T = None, ruling.winner.T
@@ -274,6 +304,11 @@ def decide(
         fine = refine(source, target, ruling.winner.T, icp)
         T = fine.T_target_source
     clock.lap("fine")
+    adjusted = None
+    if control is not None and fine is not None:
+        adjusted = adjust(fine, control, dof)
+    if adjusted is not None:
+        fine, T = adjusted.fine, adjusted.fine.T_target_source
     status, reason = _judged(court, ruling, fine, params)
     if status == "ok":
         hand = handedness(court, levels, ruling.winner, quick, params.verdict)
@@ -281,6 +316,7 @@ def decide(
             return _refused(LEFT_SENTENCE)
         reason += " Its mirror image fits as well." if hand == "unknown" else ""
         clock.lap("mirror check")
+    status, reason = weigh_control(status, reason, adjusted)
     listed = _listed(ruling, T, starts, source, target)
     return Found(
         status=status,
@@ -291,6 +327,7 @@ def decide(
         hypotheses=listed,
         margin=_margin(listed),
         ruling=ruling,
+        adjusted=adjusted,
     )
 
 

@@ -83,3 +83,5 @@ class Registration:
     parameters: Mapping[str, Any] = field(default_factory=dict)
     pairs: Mapping[str, Any] | None = None
     """What the picked pairs said (`picked_pairs.pairs_document`); None: there were none."""
+    checks: Mapping[str, Any] | None = None
+    """What control and check points said (`control.checks_document`); None: there were none."""

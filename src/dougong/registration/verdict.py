@@ -77,6 +77,9 @@ class Ruling:
     sharpness: float
     violation: float
     probability: float
+    overruled: Comparison | None = None
+    """How the winner compares with a pose that is not allowed (by a hint, by control points) and
+    that the clouds prefer beyond doubt; None: there is none."""
 
 
 def compare(court: Court, winner: Testimony, rival: Testimony, block_m: float) -> Comparison:
@@ -152,8 +155,13 @@ def rule(
     poses = separate(poses, at)
     rivals = propose_rivals(court, poses[0], params.rivals)
     poses = separate([*poses, *(_refined(court, levels, T, icp) for T in rivals)], at)
+    best = poses[0]
     poses = [pose for pose in poses if is_allowed(pose.T)] or poses
     winner, others = poses[0], poses[1:]
+    overruled = None
+    if best is not winner:
+        overruled = compare(court, best, winner, params.block_m)
+        overruled = overruled if is_beaten(overruled, params) else None
     results = [compare(court, winner, other, params.block_m) for other in others]
     beaten = [c for c in results if is_beaten(c, params)]
     undecided = [c for c in results if not is_beaten(c, params)]
@@ -165,7 +173,8 @@ def rule(
         explained=explained,
         sharpness=sharp,
         violation=violation(court, winner),
-        probability=_probability(undecided, beaten, sharp, params),
+        probability=0.0 if overruled else _probability(undecided, beaten, sharp, params),
+        overruled=overruled,
     )
 
 
@@ -221,6 +230,12 @@ def status_of(ruling: Ruling, fine: FineResult | None, params: Verdict) -> tuple
             f"under the best pose {ruling.violation:.0%} of the structure stands where the other "
             f"cloud saw free space (at most {params.most_violation:.0%} expected): the true pose "
             "was not found, or the place was rebuilt. A yaw hint or control points would help."
+        )
+    if ruling.overruled is not None:
+        return "ambiguous", (
+            f"the clouds contradict the hint or the control points: a pose elsewhere explains "
+            f"{ruling.overruled.gain:.1%} more of the surface (p = "
+            f"{max(ruling.overruled.p_value, 1e-9):.1g}). Check them, or register without them."
         )
     if ruling.undecided:
         return "ambiguous", _rivals_in_words(ruling)
