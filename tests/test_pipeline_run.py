@@ -29,7 +29,7 @@ def cloud(seed, offset=(0.0, 0.0, 0.0)):
 def answer(status):
     """A registration that says `status` and shifts by SHIFT."""
 
-    def register(source, target, params, *, source_kind, target_kind, control):
+    def register(source, target, params, *, source_kind, target_kind, control=None):
         assert params.filtered
         matrix = np.eye(4)
         matrix[:3, 3] = SHIFT
