@@ -11,13 +11,11 @@ from dougong.formats import write
 from dougong.pipeline.control import control_of, quality_document, read_control
 from dougong.pipeline.pairs import HEADER
 from dougong.registration import Register, register
+from dougong.registration.checks import check_error, level_of, reaches
 from dougong.registration.control import (
     ControlPoints,
     adjust,
-    check_error,
-    level_of,
     local_control,
-    reaches,
 )
 from dougong.registration.overlap import apply
 from dougong.registration.result import FineResult

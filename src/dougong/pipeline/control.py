@@ -11,7 +11,8 @@ from dougong.errors import InputError
 from dougong.pipeline.pairs import COORDINATES, HEADER, coordinates_in, csv_rows
 from dougong.pipeline.project import Project
 from dougong.pipeline.provenance import sha256
-from dougong.registration.control import ControlPoints, reaches
+from dougong.registration.checks import reaches
+from dougong.registration.control import ControlPoints
 
 _ROLES = ("control", "check")
 

@@ -15,13 +15,13 @@ from dougong.cloud import Cloud, Frame
 from dougong.errors import FrameError
 from dougong.params import Parameters
 from dougong.registration import hypotheses as ranking
+from dougong.registration.checks import checks_document
 from dougong.registration.congruent_sets import CongruentSets, four_pcs
 from dougong.registration.control import (
     Adjusted,
     Control,
     ControlPoints,
     adjust,
-    checks_document,
     local_control,
     weigh_control,
 )
