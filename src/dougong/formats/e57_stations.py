@@ -30,6 +30,7 @@ from dougong.formats.e57_fields import (
 )
 from dougong.formats.e57_pose import Motion, Pose, motion_of
 from dougong.formats.las_fields import canonical, columns_of, coordinate_fields, shrunk_colours
+from dougong.formats.las_header import LasHeader, las_attributes
 from dougong.formats.units import units_of
 from dougong.typing import Transform
 
@@ -139,6 +140,10 @@ def _foreign(cloud: Cloud, notes: list[str]) -> Station:
         notes.append("coordinates are written as doubles, as they lie on no decimal step.")
     dropped = coordinate_fields(cloud)
     columns = {n: v for n, v in columns_of(cloud).items() if n not in dropped}
+    if isinstance(cloud.header, LasHeader):
+        # Every LAS point has every field of its format: what is zero throughout is not in use.
+        unused = [n for n in las_attributes(cloud.header) if n in columns and not columns[n].any()]
+        columns = {n: v for n, v in columns.items() if n not in unused}
     named: dict[str, NDArray[Any]] = {}
     for name, values in shrunk_colours(columns, notes).items():
         target = canonical(name)

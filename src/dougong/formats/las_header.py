@@ -82,6 +82,13 @@ def bits_of(point_format: int) -> dict[str, BitField]:
     return _BITS_MODERN if point_format >= 6 else _BITS_LEGACY
 
 
+def las_attributes(header: LasHeader) -> set[str]:
+    """Return the attributes that every point of the header's format has, used or not."""
+    return {name for name, _ in POINT_FORMATS[header.point_format]} | set(
+        bits_of(header.point_format)
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Vlr:
     """One variable length record, its texts as the bytes of the file."""

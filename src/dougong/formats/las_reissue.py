@@ -8,7 +8,6 @@ pass before, for LAS by its header.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,6 +33,7 @@ def reissue_las(
     matrix: Transform,
     target: Frame,
     *,
+    header: LasHeader | None,
     overwrite: bool = False,
 ) -> Written:
     """Write `source` again with every point moved.
@@ -46,6 +46,8 @@ def reissue_las(
     matrix : ndarray, shape (4, 4)
         From the file coordinates of the source to those of `target`.
     target : Frame
+    header : LasHeader or None
+        Of the source where it is LAS: it says where the points lie.
 
     Raises
     ------
@@ -56,9 +58,7 @@ def reissue_las(
     """
     refuse_bad_target(output, overwrite=overwrite, source=source)
     job = _Job(chunks, source, output, matrix, target)
-    with closing(chunks()) as reading:
-        header = next(reading).header
-    if isinstance(header, LasHeader) and header.point_format not in _WAVEFORM_FORMATS:
+    if header is not None and header.point_format not in _WAVEFORM_FORMATS:
         # Offsets follow from where the header says the points lie: one that lies about it matters
         # only where they do not fit.
         try:

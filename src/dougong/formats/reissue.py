@@ -103,7 +103,12 @@ def reissue(
         raise InputError(msg)
     from dougong.formats.las_reissue import reissue_las
 
-    survey = None if kind == "las" else survey_of(scans_of(source, kind), chunk_points)
+    if kind == "las":
+        from dougong.formats.las import read_las_header
+
+        header, survey = read_las_header(source), None
+    else:
+        header, survey = None, survey_of(scans_of(source, kind), chunk_points)
 
     def chunks() -> Generator[Cloud]:
         if survey is None:
@@ -111,4 +116,6 @@ def reissue(
         else:
             yield from iterate_scans(scans_of(source, kind), chunk_points, survey)
 
-    return reissue_las(chunks, source, output, matrices[0], target, overwrite=overwrite)
+    return reissue_las(
+        chunks, source, output, matrices[0], target, header=header, overwrite=overwrite
+    )
