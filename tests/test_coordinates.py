@@ -1,5 +1,6 @@
 """Reference systems through every writer, and axes that were swapped or turned round."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,10 +8,11 @@ import pytest
 from pyproj import CRS
 
 import dougong
+from dougong.cli import call
 from dougong.cloud import Cloud, Frame
-from dougong.errors import FrameError
+from dougong.errors import FrameError, InputError
 from dougong.formats.check import check
-from dougong.formats.units import as_wkt, is_same_crs, las_wkt, units_of
+from dougong.formats.units import as_wkt, in_system, is_same_crs, las_wkt, units_of
 from dougong.pipeline import registering
 from dougong.pipeline.axes import mirrored_axes, upside_down
 from dougong.registration import Register
@@ -149,3 +151,47 @@ def test_heights_from_two_surfaces_are_named(monkeypatch, systems, rise, is_said
     pair = [on_map(name, crs=crs) for name, crs in zip(("scan", "drone"), systems, strict=True)]
     said = " ".join(registering.register(*pair).notes)
     assert (f"drone lies {rise:+.2f} m higher: as heights above the ellipsoid" in said) is is_said
+
+
+def test_a_file_without_a_system_can_be_given_one():
+    plain = on_map("drone.xyz")
+    named = in_system(plain, "EPSG:32650+5773")
+    np.testing.assert_array_equal(named.frame.to_file(named.xyz), plain.frame.to_file(plain.xyz))
+    assert units_of(named.frame.crs).name == "WGS 84 / UTM zone 50N + EGM96 height"
+    assert not named.is_moved
+    assert in_system(named, named.frame.crs) is named
+    assert in_system(plain, None) is plain
+
+
+def test_feet_of_a_given_system_become_metres():
+    feet = in_system(on_map("a"), "EPSG:2225+6360")
+    unit = 1200 / 3937
+    assert feet.frame.unit_m == pytest.approx((unit,) * 3)
+    np.testing.assert_allclose(feet.frame.to_file(feet.xyz), on_map("a").xyz + PLACE // 1, atol=1)
+    np.testing.assert_allclose(np.ptp(feet.xyz, axis=0), unit * np.ptp(on_map("a").xyz, axis=0))
+
+
+def test_a_given_system_must_be_one_and_must_not_contradict_the_file():
+    with pytest.raises(InputError, match=r"'nonsense' of a is not understood"):
+        in_system(on_map("a"), "nonsense")
+    with pytest.raises(FrameError, match="a names WGS 84 / UTM zone 50N itself"):
+        in_system(on_map("a", crs="EPSG:32650"), "EPSG:32651")
+
+
+def test_the_given_system_reaches_registration_and_result(tmp_path, monkeypatch, capsys):
+    dougong.write(Cloud.from_points(SCAN), tmp_path / "scan.laz")
+    np.savetxt(tmp_path / "drone.xyz", SCAN + PLACE, fmt="%.4f")
+    monkeypatch.setattr(registering, "search", lambda *_, **__: nothing(np.eye(4)))
+    for module in ("overview", "slices"):
+        monkeypatch.setattr(f"dougong.report.render.{module}", lambda *_: [])
+    tokens = ["register", str(tmp_path / "scan.laz"), str(tmp_path / "drone.xyz"), "--out",
+              str(tmp_path / "out"), "--target-crs", "EPSG:32650", "--target-kind",
+              "photogrammetry", "--source-kind", "lidar", "--quiet"]  # fmt: skip
+    assert call(tokens) == 0, capsys.readouterr().err
+    found = json.loads((tmp_path / "out" / "registration.json").read_text())
+    assert found["grid"]["target"]["system"] == "WGS 84 / UTM zone 50N"
+    assert found["scale"] == pytest.approx(0.9996, abs=1e-5)
+    assert "UTM zone 50N" in found["target_frame"]["crs_wkt"]
+
+
+SCAN = np.random.default_rng(7).uniform(0, 20, (3000, 3))

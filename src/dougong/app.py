@@ -194,6 +194,7 @@ def register_files(
     progress: Progress,
     pairs: Path | None = None,
     control: Path | None = None,
+    crs: tuple[str | None, str | None] = (None, None),
 ) -> Document:
     """Register one file onto another and write registration.json and report.html into `out`.
 
@@ -209,6 +210,8 @@ def register_files(
         A CSV file of places picked in both clouds.
     control : Path, optional
         A CSV file of control and check points.
+    crs : pair of str, optional
+        Reference systems of a source and a target whose files name none.
     """
     from dougong.pipeline import jobs
     from dougong.pipeline.outputs import refuse_existing, result_folder
@@ -228,6 +231,7 @@ def register_files(
             progress=progress,
             pairs=pairs,
             control=control,
+            crs=crs,
         )
         _build_report(part, progress)
     return document

@@ -29,6 +29,8 @@ def command(
     pairs: Path | None = None,
     control: Path | None = None,
     grid_scale: str = "auto",
+    source_crs: str | None = None,
+    target_crs: str | None = None,
     accept_best: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     common: Common = DEFAULT,
@@ -72,6 +74,10 @@ def command(
     grid_scale
         Combined factor (grid / ground) of a cloud in a map projection; auto: from its system and
         height; off: the map is true to scale, as site-calibrated ground systems are; or a number.
+    source_crs
+        Coordinate system of a SOURCE that names none, such as EPSG:32650.
+    target_crs
+        The same for TARGET.
     accept_best
         Exit with 0 and take the best pose where several are possible; the status stays.
     overwrite
@@ -92,6 +98,7 @@ def command(
                 "grid_scale": grid_scale,
                 "accept_best": accept_best,
             },
+            crs=(source_crs, target_crs),
             source_kind=source_kind,
             target_kind=target_kind,
             overwrite=overwrite,

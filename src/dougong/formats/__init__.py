@@ -20,7 +20,7 @@ from dougong.formats.registry import (
     write_stations,
 )
 from dougong.formats.reissue import can_reissue, reissue, scans_in
-from dougong.formats.units import is_same_crs, require_metric, units_of
+from dougong.formats.units import in_system, is_same_crs, require_metric, units_of
 
 __all__ = [
     "SUFFIXES",
@@ -34,6 +34,7 @@ __all__ = [
     "copy_file",
     "describe",
     "faults_of",
+    "in_system",
     "is_same_crs",
     "iterate",
     "part_of",

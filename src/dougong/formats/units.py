@@ -1,13 +1,13 @@
 """What a coordinate reference system says about units, and which systems cannot be worked in."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from dougong.cloud import Cloud
-from dougong.errors import FrameError
+from dougong.errors import FrameError, InputError
 
 METRES = (1.0, 1.0, 1.0)
 
@@ -259,6 +259,48 @@ def metre_form(wkt: str) -> str:
     if "components" in document:
         document["name"] += " (in metres)"
     return str(CRS.from_json_dict(document).to_wkt())
+
+
+def in_system(cloud: Cloud, crs: str | None) -> Cloud:
+    """Return `cloud` in the reference system that the user names for it; None: as it is.
+
+    Parameters
+    ----------
+    cloud : Cloud
+        Of a file that names no system; its numbers then are in the units of `crs`.
+    crs : str or None
+        WKT, or a code such as "EPSG:32650" (compound: "EPSG:32650+5773").
+
+    Raises
+    ------
+    InputError
+        The system is not understood.
+    FrameError
+        The file names another system itself.
+    """
+    if crs is None:
+        return cloud
+    wkt = as_wkt(crs)
+    if wkt is None:
+        msg = (
+            f"the coordinate system {crs!r} of {cloud.name} is not understood; give an EPSG code "
+            "such as EPSG:32650, or WKT."
+        )
+        raise InputError(msg)
+    frame = cloud.frame
+    if frame.crs is not None:
+        if is_same_crs(frame.crs, wkt):
+            return cloud
+        msg = (
+            f"{cloud.name} names {units_of(frame.crs).name} itself, and {units_of(wkt).name} was "
+            "given for it. Leave the setting out, or correct the file."
+        )
+        raise FrameError(msg)
+    units = units_of(wkt)
+    ratio = np.asarray(units.unit_m) / np.asarray(frame.unit_m)
+    placed = replace(frame, origin=frame.origin * ratio, crs=wkt, unit_m=units.unit_m)
+    # Not a motion: the file's numbers stay, only what they mean is known now.
+    return replace(cloud, xyz=cloud.xyz * ratio, frame=placed)
 
 
 def require_metric(cloud: Cloud) -> None:

@@ -16,6 +16,7 @@ from dougong.formats import (
     can_reissue,
     describe,
     faults_of,
+    in_system,
     is_same_crs,
     read,
     reissue,
@@ -332,6 +333,7 @@ def register_files(
     progress: Progress,
     pairs: Path | None = None,
     control: Path | None = None,
+    crs: tuple[str | None, str | None] = (None, None),
 ) -> dict[str, Any]:
     """Register one file onto another; write ``registration.json`` into the folder `out`.
 
@@ -353,9 +355,10 @@ def register_files(
     kinds: list[Kind] = []
     inputs = []
     notes = []
-    for path, kind in ((source, source_kind), (target, target_kind)):
+    asked = ((source, source_kind, crs[0]), (target, target_kind, crs[1]))
+    for path, kind, system in asked:
         progress.stage(f"reading {path.name}")
-        cloud = read(path)
+        cloud = in_system(read(path), system)
         clouds.append(replace(cloud, name=stem(path)))
         if kind is None:
             kind, why = guess_kind(describe(path))

@@ -10,7 +10,7 @@ import numpy as np
 from dougong.cloud import Cloud
 from dougong.errors import FrameError
 from dougong.filters.selection import Reason
-from dougong.formats import describe, faults_of, is_same_crs, read, read_stations
+from dougong.formats import describe, faults_of, in_system, is_same_crs, read, read_stations
 from dougong.pipeline.memory import Room
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Entry, files_of
@@ -144,6 +144,7 @@ class Loader:
         """Read the file, then filter its clouds one by one."""
         with self.clock.measure("read"):
             clouds = [read(file)] if entry.registered else read_stations(file)
+            clouds = [in_system(cloud, entry.crs) for cloud in clouds]
         for station in range(len(clouds)):
             # Each raw cloud is let go as soon as it is filtered.
             cloud, clouds[station] = clouds[station], clouds[station].select(np.arange(0))
@@ -170,7 +171,8 @@ class Loader:
             grid=recipe.octree_voxel_grid, after=lambda bench: lidar_after_grid(bench, recipe)
         )
         points = describe(file).points
-        for station, chunks in enumerate(stations_of(file, split=not entry.registered)):
+        for station, raw in enumerate(stations_of(file, split=not entry.registered)):
+            chunks = (in_system(chunk, entry.crs) for chunk in raw)
             key = self._key(entry, digest, station)
             books = self.store.load(key)
             if books is not None:
@@ -195,6 +197,7 @@ class Loader:
 
     def _key(self, entry: Entry, digest: str, station: int) -> str:
         params = self.recipe.lidar if entry.kind == "lidar" else self.recipe.photogrammetry
+        digest += f" in {entry.crs}" if entry.crs is not None else ""
         return self.store.key(digest, -1 if entry.registered else station, entry.kind, params)
 
     def _say_known(self, name: str) -> None:

@@ -34,6 +34,8 @@ class Entry(Parameters):
     kind: Kind
     files: Annotated[tuple[str, ...], Field(min_length=1)]
     """Paths or patterns, relative to the project file."""
+    crs: str | None = None
+    """Coordinate system of files that name none: "EPSG:32650", compound "EPSG:32650+5773", WKT."""
     registered: bool = True
     """False: each station (E57) or file moves by itself."""
     scale_known: bool = True
