@@ -61,7 +61,9 @@ def test_the_result_has_the_files_of_the_contract(demo):
     assert found == {
         "merged.copc.laz", "clouds/lidar.laz", "clouds/drone.laz", "registrations/lidar.json",
         "result.json", "report.html", "demo.json", "scene/lidar.laz", "scene/drone.laz",
-        "scene/truth.json", "removed/lidar.laz", "removed/drone.laz",
+        "scene/truth.json", "removed/lidar.laz", "removed/drone.laz", "distances/lidar.laz",
+        "registrations/lidar.cloudcompare.txt", "registrations/lidar.pdal.json",
+        "registrations/lidar.metashape.xml",
     }  # fmt: skip
     assert [path.name for path in out.parent.iterdir()] == ["hall"], "nothing is left beside it"
 
