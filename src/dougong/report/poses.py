@@ -61,8 +61,8 @@ def score_chart(hypotheses: tuple[Mapping[str, Any], ...], margin: float) -> str
         f'<text x="{left - 8}" y="{at(0, 1)[1] + 5:.0f}" text-anchor="end">1</text>'
         f'<text x="{left - 8}" y="{height - low + 4}" text-anchor="end">0</text>'
         f"{ticks}{''.join(marks)}{words}"
-        f'<text x="{left}" y="{height - 6}">yaw, deg; dot: the pose that was taken, '
-        "triangles: the others</text></svg>"
+        f'<text x="{left + span / 2:.0f}" y="{height - 4}" text-anchor="middle">yaw, deg</text>'
+        "</svg>"
     )
 
 
