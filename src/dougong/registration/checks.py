@@ -87,7 +87,8 @@ def check_error(residuals: Points) -> dict[str, Any]:
         ``check_rmse_m`` (3-D), of the plan and of heights; ``error95_m`` = 1.61 x RMSE (normal
         errors), 1.73 x in plan, 1.96 x in height; ``upper95_m``, the same for the RMSE's upper
         95 % confidence bound, which few points make large; ``distribution_free95_m``, the largest
-        of at least 59 errors, else None; ``level``, the finest USIBD level whose upper end is not below ``upper95_m``, None
+        of at least 59 errors, else None; ``level``, the finest USIBD level whose upper end is not
+        below ``upper95_m``, None
         where that is coarser than all.
     """
     count = len(residuals)
