@@ -13,6 +13,7 @@ on brackets and rafters; worst patches are the 5 % of 0.25 m cells that lose mos
 
 import argparse
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -39,8 +40,10 @@ def main() -> None:
             return
         arguments.json.write_text(text + "\n", encoding="utf-8")
     settings = [row for row in rows if "curve" not in row]
-    print(f"{'percent of':24s}" + "".join(f"{name.replace('_', ' '):>16s}" for name in COLUMNS))
-    for name, cells in summary(settings, "filter", COLUMNS).items():
+    # The facade has no vegetation.
+    columns = [name for name in COLUMNS if any(not math.isnan(row[name]) for row in settings)]
+    print(f"{'percent of':24s}" + "".join(f"{name.replace('_', ' '):>16s}" for name in columns))
+    for name, cells in summary(settings, "filter", columns).items():
         print(f"{name:24s}" + "".join(f"{mean:9.1f} ±{spread:5.2f}" for mean, spread in cells))
 
 
