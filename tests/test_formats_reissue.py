@@ -9,7 +9,15 @@ import pytest
 
 from dougong.cloud import Cloud, Frame
 from dougong.errors import InputError, OutputError
-from dougong.formats import can_reissue, is_same_crs, read, reissue, units_of, write
+from dougong.formats import (
+    can_reissue,
+    is_same_crs,
+    read,
+    reissue,
+    scans_in,
+    units_of,
+    write,
+)
 from e57_surveys import survey, turn
 from reference.e57 import rotation_of, tree, world
 
@@ -127,6 +135,30 @@ def test_e57_in_a_frame_of_feet_is_metres(tmp_path):
     assert "metre" in after["/coordinateMetadata"][1]
 
 
+def test_scans_of_a_ptx_file_move_each_by_its_own_matrix(tmp_path):
+    rng = np.random.default_rng(3)
+    lines, own = [], []
+    for k in range(3):
+        points = np.round(rng.uniform(1, 20, (50, 3)), 4)
+        own.append(points + [100 * k, 0, 0])
+        lines += ["5", "10", f"{100 * k} 0 0", "1 0 0", "0 1 0", "0 0 1"]
+        lines += ["1 0 0 0", "0 1 0 0", "0 0 1 0", f"{100 * k} 0 0 1"]
+        lines += [f"{x:.4f} {y:.4f} {z:.4f} 0.5" for x, y, z in points]
+    (tmp_path / "a.ptx").write_text("\n".join(lines) + "\n")
+    assert scans_in(tmp_path / "a.ptx")[0] == 3
+    turned = [motion(), None, motion(0.999)]
+    reissue(tmp_path / "a.ptx", tmp_path / "out.laz", turned, TARGET, chunk_points=30)
+    found = read(tmp_path / "out.laz")
+    station = found.attribute("station")
+    assert station.tolist() == [0] * 50 + [2] * 50
+    for k in (0, 2):
+        there = own[k] @ turned[k][:3, :3].T + turned[k][:3, 3]
+        xyz = found.frame.to_file(found.xyz)[station == k]
+        assert np.abs(xyz - there).max() < 6e-5
+    with pytest.raises(InputError, match="keeps 3 scans apart, got a list of 1"):
+        reissue(tmp_path / "a.ptx", tmp_path / "b.laz", [motion()], TARGET)
+
+
 def test_a_full_disk_leaves_nothing(tmp_path):
     source = written_as(tmp_path, ".las")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -144,5 +176,5 @@ def test_what_does_not_go_together_is_refused(tmp_path):
     assert not can_reissue(source, tmp_path / "a.e57")
     with pytest.raises(InputError, match="cannot be made"):
         reissue(source, tmp_path / "a.e57", [motion()], TARGET)
-    with pytest.raises(InputError, match="is one cloud"):
+    with pytest.raises(InputError, match="keeps 1 scans apart, got a list of 2"):
         reissue(source, tmp_path / "a.laz", [motion(), motion()], TARGET)

@@ -31,7 +31,7 @@ def short_cuts(monkeypatch):
     monkeypatch.setattr("dougong.report.render.overview", lambda *_: [])
     monkeypatch.setattr("dougong.report.render.slices", lambda *_: [])
 
-    def register(source, target, params, *, source_kind, target_kind):
+    def register(source, target, params, **_):
         status = "ambiguous" if "2" in source.name else "ok"
         return Registration(
             status=status, matrix=motion(), reason="as the test says", probability=0.5, scale=1.0,
@@ -121,6 +121,21 @@ def test_the_project_file_can_ask(folder, capsys):
     _, result = run(capsys, path, "--out", folder / "out")
     assert len(result["full_resolution"]["files"]) == 3
     assert (folder / "out" / "full" / "tower.laz").is_file()
+
+
+def test_a_reference_gets_the_system_that_the_user_gave(folder, capsys):
+    (folder / "project.toml").write_text(
+        '[project]\nreference="tower"\nfull_resolution=true\n'
+        '[[cloud]]\nname="tower"\nkind="lidar"\nfiles=["tower.laz"]\ncrs="EPSG:32650"\n'
+        '[[cloud]]\nname="drone"\nkind="photogrammetry"\nfiles=["drone.copc.laz"]\n'
+    )
+    code, _ = run(capsys, folder / "project.toml", "--out", folder / "out")
+    assert code == 0
+    given, was = read(folder / "out" / "full" / "tower.laz"), read(folder / "tower.laz")
+    assert was.frame.crs is None
+    assert "32650" in given.frame.crs
+    assert np.abs(given.frame.to_file(given.xyz) - was.frame.to_file(was.xyz)).max() < 1e-8
+    assert "32650" in read(folder / "out" / "full" / "drone.laz").frame.crs
 
 
 def test_too_little_disk_is_said_before_any_work(folder, capsys, monkeypatch):

@@ -7,7 +7,7 @@ pass before, for LAS by its header.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def reissue_las(
     chunks: Chunks,
     source: Path,
     output: Path,
-    matrix: Transform,
+    matrices: Sequence[Transform | None],
     target: Frame,
     *,
     header: LasHeader | None,
@@ -43,8 +43,9 @@ def reissue_las(
     chunks : callable
         Starts reading the file from its beginning; all its chunks share one frame.
     source, output : Path
-    matrix : ndarray, shape (4, 4)
-        From the file coordinates of the source to those of `target`.
+    matrices : sequence of ndarray (4, 4) or None
+        For each scan of the source: from its file coordinates to those of `target`; None leaves
+        the scan out.
     target : Frame
     header : LasHeader or None
         Of the source where it is LAS: it says where the points lie.
@@ -57,15 +58,24 @@ def reissue_las(
         The output exists, the disk is full, or the coordinates do not fit; nothing is left behind.
     """
     refuse_bad_target(output, overwrite=overwrite, source=source)
-    job = _Job(chunks, source, output, matrix, target)
-    if header is not None and header.point_format not in _WAVEFORM_FORMATS:
+    job = _Job(chunks, source, output, matrices, target)
+    whole = matrices[0]
+    if header is not None and whole is not None and header.point_format not in _WAVEFORM_FORMATS:
         # Offsets follow from where the header says the points lie: one that lies about it matters
         # only where they do not fit.
         try:
-            return job.write(Whole(corners=job.moved_box(header.extent), facts={}))
+            return job.write(Whole(corners=_moved_box(header.extent, whole), facts={}))
         except OutsideLattice:
             pass
     return job.write(job.surveyed())
+
+
+def _moved_box(box: Points, matrix: Transform) -> Points:
+    """Return the (8, 3) corners of the box (2, 3) about some points, moved."""
+    places = np.indices((2, 2, 2)).reshape(3, 8).T
+    corners = np.where(places == 0, box[0], box[1])
+    moved: Points = corners @ matrix[:3, :3].T + matrix[:3, 3]
+    return moved
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,24 +83,37 @@ class _Job:
     chunks: Chunks
     source: Path
     output: Path
-    matrix: Transform
+    matrices: Sequence[Transform | None]
     target: Frame
 
-    def moved_box(self, box: Points) -> Points:
-        """Return the (8, 3) corners of the box (2, 3) about the source's points, moved."""
-        places = np.indices((2, 2, 2)).reshape(3, 8).T
-        corners = np.where(places == 0, box[0], box[1])
-        moved: Points = corners @ self.matrix[:3, :3].T + self.matrix[:3, 3]
-        return moved
+    def station_of(self, chunk: Cloud) -> int:
+        """Return which scan of the source a chunk belongs to."""
+        return int(chunk.header.station) if len(self.matrices) > 1 else 0
+
+    def pieces(self) -> Iterator[tuple[Cloud, Transform]]:
+        """Yield the chunks that are written, each with its matrix."""
+        for chunk in self.chunks():
+            station = self.station_of(chunk)
+            matrix = self.matrices[station]
+            if matrix is None:
+                continue
+            if len(self.matrices) > 1:
+                marks = np.full(len(chunk), station, dtype="<u2")
+                chunk = chunk.with_attribute("station", marks)
+            yield chunk, matrix
 
     def surveyed(self) -> Whole:
         """Pass over the file once for what all its chunks must share."""
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        boxes: dict[int, tuple[Points, Transform]] = {}
         facts: dict[str, Facts] = {}
         channels: set[int] = set()
-        for chunk in self.chunks():
+        for chunk, matrix in self.pieces():
             there = chunk.frame.to_file(chunk.xyz)
-            low, high = np.minimum(low, there.min(axis=0)), np.maximum(high, there.max(axis=0))
+            box = np.stack([there.min(axis=0), there.max(axis=0)])
+            station = self.station_of(chunk)
+            low, high = boxes[station][0] if station in boxes else box
+            box = np.stack([np.minimum(low, box[0]), np.maximum(high, box[1])])
+            boxes[station] = box, matrix
             if isinstance(chunk.header, LasHeader):
                 channel = chunk.attribute("scanner_channel")
                 channels |= set(np.unique(channel).tolist()) if channel is not None else set()
@@ -98,7 +121,7 @@ class _Job:
             for name, found in facts_of(chunk).items():
                 facts[name] = found if name not in facts else facts[name].joined(found)
         return Whole(
-            corners=self.moved_box(np.stack([low, high])),
+            corners=np.concatenate([_moved_box(box, matrix) for box, matrix in boxes.values()]),
             facts=facts,
             has_mixed_channels=len(channels) > 1,
         )
@@ -109,8 +132,8 @@ class _Job:
         notes: list[str] = []
         with replacing(self.output, expected_bytes=self.source.stat().st_size) as sink:
             writer: LasWriter | None = None
-            for chunk in self.chunks():
-                moved = chunk.moved(self.matrix, self.target)
+            for chunk, matrix in self.pieces():
+                moved = chunk.moved(matrix, self.target)
                 header, records, said = las_parts(moved, packed=is_packed, whole=whole)
                 notes += [*chunk.notes, *said]
                 if writer is None:

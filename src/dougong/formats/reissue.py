@@ -27,9 +27,9 @@ def can_reissue(source: Path, output: Path) -> bool:
 
 
 def scans_in(path: Path | str) -> tuple[int, str | None]:
-    """Return how many scans a file keeps apart (1 but for E57) and its reference system, WKT.
+    """Return how many scans a file keeps apart (E57, PTX; else 1) and its reference system, WKT.
 
-    No point is read. Scans without points count too.
+    No point is read. Scans without points count too, as positions of `matrices`.
 
     Raises
     ------
@@ -46,7 +46,8 @@ def scans_in(path: Path | str) -> tuple[int, str | None]:
         from dougong.formats import las
 
         return 1, las.crs_of(las.read_las_header(path))
-    return 1, scans_of(path, kind)[0].crs
+    scans = scans_of(path, kind)
+    return getattr(scans[-1].header, "station", 0) + 1, scans[0].crs
 
 
 def reissue(
@@ -67,8 +68,9 @@ def reissue(
     Parameters
     ----------
     matrices : sequence of ndarray (4, 4) or None
-        One for each scan of an E57 file, in its order: from its file coordinates to the
-        target's. None leaves the scan out. Of other files: one.
+        One for each scan of the file (see `scans_in`), in its order: from its file coordinates to
+        the target's. None leaves the scan out. Several scans of one LAS file are told apart by the
+        extra dimension `station`.
     target : Frame
         Its reference system and units are those of the output; E57 has metres always.
     chunk_points : int
@@ -98,8 +100,13 @@ def reissue(
         motions = [None if matrix is None else to_metres @ matrix for matrix in matrices]
         crs = None if target.crs is None else metre_form(target.crs)
         return reissue_e57(source, output, motions, crs=crs, overwrite=overwrite)
-    if len(matrices) != 1 or matrices[0] is None:
-        msg = f"{source.name} is one cloud, got {len(matrices)} matrices. Pass one."
+    count = scans_in(source)[0]
+    if len(matrices) != count or all(matrix is None for matrix in matrices):
+        given = sum(matrix is not None for matrix in matrices)
+        msg = (
+            f"{source.name} keeps {count} scans apart, got a list of {len(matrices)} with {given} "
+            "matrices. Pass one for each scan, and None for those to leave out."
+        )
         raise InputError(msg)
     from dougong.formats.las_reissue import reissue_las
 
@@ -116,6 +123,4 @@ def reissue(
         else:
             yield from iterate_scans(scans_of(source, kind), chunk_points, survey)
 
-    return reissue_las(
-        chunks, source, output, matrices[0], target, header=header, overwrite=overwrite
-    )
+    return reissue_las(chunks, source, output, matrices, target, header=header, overwrite=overwrite)

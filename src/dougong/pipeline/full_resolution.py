@@ -8,7 +8,7 @@ from typing import Any
 
 from dougong.cloud import Frame
 from dougong.errors import OutputError
-from dougong.formats import PlacedStation, Written, copy_file, reissue, scans_in
+from dougong.formats import PlacedStation, Written, copy_file, is_same_crs, reissue, scans_in
 from dougong.pipeline.outputs import write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import stem
@@ -31,7 +31,7 @@ class Place:
     """Name of the project's cloud."""
     file: Path
     station: int
-    """The scan's place in an E57 file; -1: the whole file."""
+    """The scan's place in an E57 or PTX file; -1: the whole file."""
     status: str
     """reference, ok, ambiguous or failed."""
     matrix: Transform | None
@@ -143,7 +143,9 @@ def write_full_resolution(
 def _write(file: Path, output: Path, places: Sequence[Place], target: Frame) -> Written:
     """Write one file under the name `output` and the suffix that suits it."""
     suffix = "".join(file.suffixes[-2:]) if file.name.endswith(".copc.laz") else file.suffix
-    if all(place.status == "reference" for place in places):
+    is_reference = all(place.status == "reference" for place in places)
+    # A system that the user gave and the file does not name has to be written.
+    if is_reference and is_same_crs(scans_in(file)[1], target.crs):
         output = output.with_name(output.name + suffix)
         copy_file(file, output)
         return Written(path=output, points=0, bytes=output.stat().st_size)
@@ -153,7 +155,7 @@ def _write(file: Path, output: Path, places: Sequence[Place], target: Frame) -> 
         if place.station < 0:
             matrices = [place.matrix] * len(matrices)
         else:
-            matrices[place.station if is_e57 else 0] = place.matrix
+            matrices[place.station] = place.matrix
     output = output.with_name(output.name + (".e57" if is_e57 else ".laz"))
     return reissue(file, output, matrices, target)
 

@@ -38,7 +38,7 @@ class Source:
 
     @property
     def is_scan(self) -> bool:
-        """True: one scan of an E57 file, which moves by itself."""
+        """True: one scan of an E57 or PTX file, which moves by itself."""
         return self.station >= 0 and hasattr(self.filtered.cloud.header, "station")
 
 
