@@ -153,7 +153,11 @@ def prepare(paths: Sequence[Path], scratch: Path, say: Note, pairs: Path | None 
     """
     missing = why_missing()
     if missing is not None:
-        raise InputError(f"there is nothing to view with: {missing}.")
+        msg = (
+            f"this installation has no viewer ({missing}). Install dougong again with the npm "
+            "registry in reach."
+        )
+        raise InputError(msg)
     items, notes = items_of(paths)
     picked, takes = _picking(items, pairs)
     files = [_streamable(item, scratch, index, say, notes) for index, item in enumerate(items)]
