@@ -42,6 +42,9 @@ LAYOUTS = {
     "quoted header": '"x","y","z"\n1.5,2.25,3.125\n-4,5.5,6.75\n7,8,9\n',
     "exponents": "1.5e0 2.25E+0 31.25e-1\n-4 5.5 6.75\n7 8 9\n",
     "count line": "3\n1.5 2.25 3.125\n-4 5.5 6.75\n7 8 9\n",
+    "blanks and tabs": "1.5\t2.25  3.125\n-4 5.5\t6.75\n7\t8\t9\n",
+    "two lines before": "Project: hall\nx,y,z\n1.5,2.25,3.125\n-4,5.5,6.75\n7,8,9\n",
+    "units in the header": "x (m);y (m);z (m)\n1.5;2.25;3.125\n-4;5.5;6.75\n7;8;9\n",
     "old line ends": "1.5 2.25 3.125\r-4 5.5 6.75\r7 8 9\r",
     "two blocks": "2\n1.5 2.25 3.125\n-4 5.5 6.75\n1\n7 8 9\n",
 }
@@ -272,6 +275,7 @@ def test_local_coordinates_do_not_depend_on_the_order_of_points(tmp_path):
         (b"name,colour\nwall,red\nroof,blue\n", "no rows of at least three numbers"),
         (b"a,b,c\n1,2,3\n", "x, y and z were expected"),
         (b"nan nan nan\nnan nan nan\n", "none of its 2 points"),
+        (b"1.5 " * 50_000, "no rows of at least three numbers; it starts with '1.5 1.5"),
         (b"1 2 3\0\0\0", "not text"),
         ("1 2 3\n".encode("utf-16"), "UTF-16.*Save it as UTF-8"),
         (
@@ -295,3 +299,12 @@ def test_real_scans(data):
     expected = np.loadtxt(data / "lion_scans" / "lionscan1.xyz")
     assert np.abs(coordinates(cloud) - expected).max() < 1e-12
     assert cloud.frame.step == (0.001, 0.001, 0.001)
+
+
+def test_bytes_that_are_not_utf8_make_no_noise(tmp_path, capfd):
+    rows = [f"{i} 2 3".encode() for i in range(200)]
+    rows[50:50] = [b"# Geb\xe4ude", b"\xff\xfe\xfa"]
+    cloud = read(save(tmp_path, b"\n".join(rows)))
+    assert len(cloud) == 200
+    assert "1 of 201 rows" in cloud.notes[0]
+    assert capfd.readouterr().err == ""

@@ -206,6 +206,7 @@ def _layout(path: Path, sample: bytes, *, is_whole: bool) -> Layout:
     has_old_line_ends = b"\n" not in sample and b"\r" in sample
     if has_old_line_ends:
         sample = sample.replace(b"\r", b"\n")
+    shown = sample[:80].decode("utf-8", "replace")
     if not is_whole:
         sample = sample[: sample.rfind(b"\n") + 1]
     names, count, odd = None, None, ""
@@ -225,12 +226,11 @@ def _layout(path: Path, sample: bytes, *, is_whole: bool) -> Layout:
             continue
         if _has_numbers(words):
             return _from_rows(sample[start:], start, delimiter, names, count, has_old_line_ends)
-        if names is not None:
-            odd = text
-            break
+        # Of several lines before the numbers the last one names the columns.
+        odd = odd or (text if names is not None else "")
         text = text.lstrip("#/%! ")
         names = tuple(split_line(text, _delimiter(text)))
-    found = odd or next(iter(sample[:80].decode("utf-8", "replace").splitlines()), "")
+    found = odd or next(iter(shown.splitlines()), "")
     msg = (
         f"{path.name} has no rows of at least three numbers; {'after one line' if odd else 'it'} "
         f"{'comes' if odd else 'starts with'} {found[:60]!r}. Expected x y z in columns."
@@ -301,6 +301,11 @@ def _is_header(text: str) -> bool:
 
 
 def _delimiter(line: str) -> str:
+    words = line.split()
+    has_gaps = "\t\t" in line or line.endswith("\t")
+    are_numbers = all(number_in(word, has_decimal_comma=True) is not None for word in words)
+    if are_numbers and not has_gaps and ("," not in line or _commas_are_decimal(line)):
+        return " "  # blanks and tabs in any mixture
     for delimiter in (";", "\t", ","):
         if delimiter in line and not (delimiter == "," and _commas_are_decimal(line)):
             return delimiter

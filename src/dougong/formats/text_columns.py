@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 from numpy.typing import NDArray
 
 _SYNONYMS = {
-    "x": {"x", "east", "easting", "x_coord", "coord_x", "x[m]", "x(m)", "cartesianx", "rechtswert"},
-    "y": {"y", "north", "northing", "y_coord", "coord_y", "y[m]", "y(m)", "cartesiany", "hochwert"},
+    "x": {"x", "east", "easting", "x_coord", "coord_x", "cartesianx", "rechtswert"},
+    "y": {"y", "north", "northing", "y_coord", "coord_y", "cartesiany", "hochwert"},
     "z": {
-        "z", "height", "elevation", "elev", "alt", "altitude", "z_coord", "coord_z", "z[m]",
-        "z(m)", "cartesianz", "h",
+        "z", "height", "elevation", "elev", "alt", "altitude", "z_coord", "coord_z",
+        "cartesianz", "h",
     },
     "intensity": {"intensity", "i", "int", "reflectance", "remission"},
     "red": {"red", "r", "rf"},
@@ -21,6 +23,7 @@ _SYNONYMS = {
     "nz": {"nz", "normal_z", "normalz"},
     "classification": {"classification", "class", "label"},
 }  # fmt: skip
+_UNIT = re.compile(r"\s*[\[(](m|metres?|meters?)[\])]$")
 _RGB = ("red", "green", "blue")
 _NORMAL = ("nx", "ny", "nz")
 
@@ -29,7 +32,7 @@ def named_columns(words: tuple[str, ...]) -> tuple[str, ...]:
     """Return attribute names from the words of a header line, each once."""
     names: list[str] = []
     for word in words:
-        key = word.strip().lower().removeprefix("scalar_")
+        key = _UNIT.sub("", word.strip().lower().removeprefix("scalar_"))
         name = next((name for name, same in _SYNONYMS.items() if key in same), None)
         name = name if name is not None and name not in names else word.strip() or "field"
         unique, number = name, 2

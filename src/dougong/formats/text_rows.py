@@ -20,6 +20,8 @@ _BLOCK_BYTES = 1 << 26
 _FEW_LINES = 64
 _MISSING = ["nan", "NaN", "NAN", "-nan", "-nan(ind)", "", "null", "NULL", "NA", "None", "-", "*"]
 _PATIENCE_S = 5.0
+_ASCII = bytes(range(128)) + b"?" * 128
+"""No number has other characters, and pyarrow stumbles over bytes that are not UTF-8."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +107,8 @@ def is_remark(line: bytes) -> bool:
 
 def table_of(data: bytes, layout: RowFormat) -> NDArray[np.float64]:
     """Return the numbers of whole lines, (m, width); a row that cannot be read is all NaN."""
+    if not data.isascii():
+        data = data.translate(_ASCII)
     if layout.delimiter == " ":
         # pyarrow tells fields apart by one character, so runs of blanks become one blank.
         data = data.replace(b"\t", b" ")
