@@ -129,8 +129,8 @@ def test_a_reference_gets_the_system_that_the_user_gave(folder, capsys):
         '[[cloud]]\nname="tower"\nkind="lidar"\nfiles=["tower.laz"]\ncrs="EPSG:32650"\n'
         '[[cloud]]\nname="drone"\nkind="photogrammetry"\nfiles=["drone.copc.laz"]\n'
     )
-    code, _ = run(capsys, folder / "project.toml", "--out", folder / "out")
-    assert code == 0
+    code, answer = run(capsys, folder / "project.toml", "--out", folder / "out")
+    assert code == 0, answer
     given, was = read(folder / "out" / "full" / "tower.laz"), read(folder / "tower.laz")
     assert was.frame.crs is None
     assert "32650" in given.frame.crs
