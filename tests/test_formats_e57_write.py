@@ -201,6 +201,30 @@ def test_degrees_are_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_scans_of_a_ptx_file_keep_their_poses(tmp_path):
+    points = np.round(np.random.default_rng(3).uniform(-20, 20, (50, 3)), 4)
+    turned = rotation_of(*turn(0.5))
+    lines = []
+    for k in range(2):
+        lines += ["5", "10", f"{100 * k} 7 2", "1 0 0", "0 1 0", "0 0 1"]
+        lines += [" ".join(map(str, (*row, 0))) for row in turned.T] + [f"{100 * k} 7 2 1"]
+        lines += [f"{x:.4f} {y:.4f} {z:.4f} 0.5 9 8 7" for x, y, z in points]
+    (tmp_path / "a.ptx").write_text("\n".join(lines) + "\n")
+    cloud = read(tmp_path / "a.ptx")
+    write(cloud.moved(motion(0.3)), tmp_path / "b.e57")
+    after = tree(tmp_path / "b.e57")
+    assert [after[f"/data3D/{k}/name"][1] for k in (0, 1)] == ["a_1", "a_2"]
+    for k in (0, 1):
+        assert after[f"/data3D/{k}/points/prototype/cartesianX"][4] == 1e-4
+        rotation, translation = pose(after, f"/data3D/{k}")
+        assert np.abs(rotation - motion(0.3)[:3, :3] @ turned).max() < 1e-9
+        there = motion(0.3) @ [100 * k, 7, 2, 1]
+        assert np.abs(translation - there[:3]).max() < 1e-6
+        own = np.stack([after[f"/data3D/{k}/points/cartesian{a}"] for a in "XYZ"], axis=1)
+        assert np.array_equal(own, np.rint(points * 1e4))
+        assert (after[f"/data3D/{k}/points/colorGreen"] == 8).all()
+
+
 def test_clouds_as_scans_of_one_file(tmp_path):
     stations = read_stations(survey(tmp_path / "a.e57"))
     foreign = las_like()

@@ -1,15 +1,16 @@
 """From a cloud to what the scans of an E57 file hold: fields, poses, limits.
 
-Points that came from E57 keep their own numbers, in the scanner's coordinates; a motion changes
-the pose, and a scale the numbers. Points from elsewhere are scaled integers about the cloud's
-local origin, which becomes the pose: small numbers, so that readers in single precision lose
-nothing.
+Points that came from E57 or PTX keep their own numbers, in the scanner's coordinates; a motion
+changes the pose, and a scale the numbers. Points from elsewhere are scaled integers about the
+cloud's local origin, which becomes the pose: small numbers, so that readers in single precision
+lose nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,8 @@ from dougong.formats.e57_fields import (
 from dougong.formats.e57_pose import Motion, Pose, motion_of
 from dougong.formats.las_fields import canonical, columns_of, coordinate_fields, shrunk_colours
 from dougong.formats.las_header import LasHeader, las_attributes
+from dougong.formats.ptx import PtxHeader
+from dougong.formats.stream import decimals_of
 from dougong.formats.units import units_of
 from dougong.typing import Transform
 
@@ -59,18 +62,41 @@ class Station:
 
 def stations_of(cloud: Cloud, notes: list[str]) -> list[Station]:
     """Return the scans that hold `cloud`; what is not kept as it was is added to `notes`."""
-    if not isinstance(cloud.header, E57Header):
+    if not isinstance(cloud.header, E57Header | PtxHeader):
         return [_foreign(cloud, notes)]
     headers = cloud.header.stations or (cloud.header,)
     station = cloud.attribute("station")
     if len(headers) == 1 or station is None:
-        return [_own(cloud, cloud.header, notes)]
+        return [_posed(cloud, cloud.header, notes)]
     found = []
     for header in headers:
         chosen = np.flatnonzero(station == header.station)
         if len(chosen):
-            found.append(_own(cloud.select(chosen), header, notes))
+            found.append(_posed(cloud.select(chosen), header, notes))
     return found
+
+
+def _posed(cloud: Cloud, header: E57Header | PtxHeader, notes: list[str]) -> Station:
+    if isinstance(header, E57Header):
+        return _own(cloud, header, notes)
+    return replace(_own(cloud, _as_e57(cloud, header), notes), header=None)
+
+
+def _as_e57(cloud: Cloud, header: PtxHeader) -> E57Header:
+    """Return how E57 would hold a scan of a PTX file: its decimals as scaled integers."""
+    fields = {}
+    for name in LENGTHS[:3]:
+        values = cloud.records[name]
+        decimals = decimals_of(values, 0) if len(values) else None
+        fields[name] = float_field(is_single=False)
+        if decimals is not None:
+            step = 10.0**-decimals
+            low, high = (int(np.rint(end / step)) for end in (values.min(), values.max()))
+            fields[name] = FieldSpec(kind="scaled", low=low, high=high, scale=step)
+    stem = header.source.stem if header.source is not None else cloud.name
+    name = f"{stem}_{header.station + 1}"
+    pose = Pose(header.rotation, header.translation)
+    return E57Header(header.station, pose, name, name, fields, header.source or Path(cloud.name))
 
 
 def _own(cloud: Cloud, header: E57Header, notes: list[str]) -> Station:

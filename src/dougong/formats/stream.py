@@ -126,7 +126,7 @@ class Survey:
             column = np.ascontiguousarray(good[:, axis])
             self.low[axis] = min(self.low[axis], column.min())
             self.high[axis] = max(self.high[axis], column.max())
-            self.decimals[axis] = _decimals(column, self.decimals[axis])
+            self.decimals[axis] = decimals_of(column, self.decimals[axis])
         return is_ok
 
     def count(self, block: Block) -> Mask:
@@ -176,7 +176,7 @@ def _is_on_lattice(values: NDArray[np.float64], decimals: int) -> bool:
     return bool((np.abs(scaled - np.rint(scaled)) <= 4 * np.spacing(np.abs(scaled))).all())
 
 
-def _decimals(values: NDArray[np.float64], start: int | None) -> int | None:
+def decimals_of(values: NDArray[np.float64], start: int | None) -> int | None:
     """Return the fewest decimal places, at least `start`, that hold all `values`; None: floats."""
     if start is None:
         return None
