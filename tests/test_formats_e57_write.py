@@ -72,6 +72,19 @@ def test_what_a_survey_says_of_its_scans_is_carried_over(tmp_path):
     assert any("table of scan lines is left out" in note for note in written.notes)
 
 
+@pytest.mark.data
+def test_a_real_file_keeps_its_picture_and_bounds(data, tmp_path):
+    """A photo that shows the object and stands nowhere belongs to the file."""
+    write(read(data / "formats" / "pumpA.e57"), tmp_path / "b.e57")
+    before, after = tree(data / "formats" / "pumpA.e57"), tree(tmp_path / "b.e57")
+    name = "/images2D/0/visualReferenceRepresentation/jpegImage"
+    assert after[name] == before[name]
+    name = "/data3D/0/sphericalBounds/azimuthEnd"
+    assert after[name] == before[name]
+    lost = {path for path in before.keys() - after.keys() if "pointGroupingSchemes" not in path}
+    assert lost == set()
+
+
 @pytest.mark.parametrize("scale", [1.0, 0.9996])
 @pytest.mark.parametrize("kind", ["scaled", "double"])
 def test_a_moved_survey_has_new_poses_and_old_numbers(tmp_path, kind, scale):

@@ -30,6 +30,7 @@ from dougong.formats.e57_xml import (
     attribute,
     child,
     children,
+    is_placed,
     number_of,
     parse,
     pose_of,
@@ -48,7 +49,6 @@ _BOUNDS = {
     "cartesianBounds": tuple(f"{a}{end}" for a in "xyz" for end in ("Minimum", "Maximum")),
     "sphericalBounds": ("rangeMinimum", "rangeMaximum"),
 }
-_WITH_POSE = ("pinholeRepresentation", "sphericalRepresentation", "cylindricalRepresentation")
 _NEGLIGIBLE_M = 1e-6
 
 
@@ -255,9 +255,7 @@ class _Edit:
             return
         for image in list(children(images)):
             guid = text_of(child(image, "associatedData3DGuid")).strip()
-            has_pose = child(image, "pose") is not None or any(
-                child(image, kind) is not None for kind in _WITH_POSE
-            )
+            has_pose = is_placed(image)
             motion = by_guid.get(guid, common)
             if motion is not None and has_pose:
                 set_pose(image, motion.applied(pose_of(image)))

@@ -30,6 +30,7 @@ from dougong.formats.e57_xml import (
     child,
     children,
     field_element,
+    is_placed,
     parse,
     pose_of,
     put,
@@ -47,7 +48,6 @@ _OF_THE_FILE = {
 }  # fmt: skip
 _OF_THE_POINTS = {
     "points", "pose", "guid", "name", "originalGuids", "pointGroupingSchemes", "cartesianBounds",
-    "sphericalBounds",
 }  # fmt: skip
 
 
@@ -107,12 +107,14 @@ class _Writer:
         self._root = self._document.createElement("e57Root")
         self._document.appendChild(self._root)
         self._guids: dict[str, tuple[str, Station]] = {}
+        self._is_still = True
 
     def write(self, stations: Sequence[Station], crs: str | None) -> None:
         """Fill the file."""
         root = self._root
         root.setAttribute("type", "Structure")
         root.setAttribute("xmlns", E57_URI)
+        self._is_still = all(station.motion is None for station in stations)
         self._extensions(stations)
         put(root, "formatName", "String", "ASTM E57 3D Imaging Data File")
         put(root, "guid", "String")
@@ -185,7 +187,8 @@ class _Writer:
                 self._notes.append(
                     "the table of scan lines is left out: points may have gone from the lines."
                 )
-        _limits(scan, station.fields, has_own=before is not None)
+        is_scaled = station.motion is not None and station.motion.scale != 1.0
+        _limits(scan, station.fields, has_own=before is not None, is_scaled=is_scaled)
         place = [*station.pose.quaternion, *station.pose.translation]
         content = self._points(scan, station), *map(words, place)
         guid = _guid("dougong", station.guid, *content)
@@ -216,12 +219,15 @@ class _Writer:
         lost = 0
         for picture in children(pictures) if pictures is not None else []:
             of = text_of(child(picture, "associatedData3DGuid")).strip()
-            if of not in self._guids:
+            is_free = not of and (not is_placed(picture) or self._is_still)
+            if of not in self._guids and not is_free:
                 lost += 1
                 continue
-            guid, station = self._guids[of]
             made = put(images, "vectorChild", "Structure", is_more=True)
             self._take_over(old, picture, made, set())
+            if is_free:
+                continue
+            guid, station = self._guids[of]
             put(made, "associatedData3DGuid", "String", guid)
             if station.motion is not None:
                 set_pose(made, station.motion.applied(pose_of(picture)))
@@ -244,9 +250,20 @@ def _originals(scan: Node, earlier: Node | None, guid: str) -> None:
 
 
 def _limits(
-    scan: Node, fields: Mapping[str, tuple[FieldSpec, NDArray[Any]]], *, has_own: bool
+    scan: Node,
+    fields: Mapping[str, tuple[FieldSpec, NDArray[Any]]],
+    *,
+    has_own: bool,
+    is_scaled: bool,
 ) -> None:
-    """Say within which bounds the points lie; and how bright and colourful they are, if new."""
+    """Say within which bounds the points lie; and how bright and colourful they are, if new.
+
+    Spherical bounds of the file that a scan came from hold for a part of its points too.
+    """
+    spherical = child(scan, "sphericalBounds")
+    if spherical is not None and is_scaled:
+        scan.removeChild(spherical)
+        spherical = None
 
     def ends(group: Node, name: str, field: str) -> None:
         values = fields[field][1]
@@ -257,7 +274,7 @@ def _limits(
         bounds = put(scan, "cartesianBounds", "Structure")
         for axis in "xyz":
             ends(bounds, axis, f"cartesian{axis.upper()}")
-    if "sphericalRange" in fields:
+    if "sphericalRange" in fields and spherical is None:
         bounds = put(scan, "sphericalBounds", "Structure")
         ends(bounds, "range", "sphericalRange")
         ends(bounds, "elevation", "sphericalElevation")

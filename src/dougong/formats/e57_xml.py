@@ -19,6 +19,9 @@ Node = Any
 """An element of `xml.dom.minidom`, which has no type of its own for elements of one kind."""
 
 
+_VIEWS = ("pinholeRepresentation", "sphericalRepresentation", "cylindricalRepresentation")
+
+
 def parse(text: bytes, name: str) -> Node:
     """Return the XML of an E57 file as a document.
 
@@ -115,6 +118,11 @@ def pose_of(node: Node) -> Pose:
 
 def _numbers(node: Node, names: str) -> NDArray[np.float64]:
     return np.array([number_of(child(node, name)) or 0.0 for name in names])
+
+
+def is_placed(picture: Node) -> bool:
+    """Say whether a picture stands somewhere: it has a pose, or a view that implies one."""
+    return any(child(picture, name) is not None for name in ("pose", *_VIEWS))
 
 
 def set_pose(node: Node, pose: Pose) -> None:
