@@ -7,27 +7,21 @@ dougong`` stay quick.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from dougong.errors import DougongError, InputError
 
 if TYPE_CHECKING:
     from dougong.cloud import Cloud
-    from dougong.evaluation.metrics import Truth
-    from dougong.evaluation.survey import Scene
-    from dougong.pipeline.memory import Room
     from dougong.pipeline.progress import Progress
-    from dougong.pipeline.project import Project
     from dougong.pipeline.recipes import Recipe
     from dougong.pipeline.steps import Filtered
     from dougong.pipeline.store import Store
     from dougong.registration import Register
     from dougong.registration.result import Registration
-    from dougong.report.server import ViewServer
-    from dougong.report.streaming import Scene as Shown
+    from dougong.report.viewing import Viewing as Viewing
     from dougong.typing import Kind
 
 Document = dict[str, Any]
@@ -257,72 +251,24 @@ def run_project(
     from dougong.pipeline.full_resolution import refuse_full_disk
     from dougong.pipeline.memory import Room
     from dougong.pipeline.outputs import refuse_existing, result_folder
-    from dougong.pipeline.project import files_of
+    from dougong.pipeline.plan import refuse_or_announce
+    from dougong.pipeline.project import asked_project, files_of
     from dougong.pipeline.run import run
 
     out = _named(out)
     refuse_existing([out / "result.json"], overwrite)
-    asked, folder = _asked_project(project, lidar, photogrammetry, full_resolution, merge)
+    asked, folder = asked_project(project, lidar, photogrammetry, full_resolution, merge)
     files = [file for entry in asked.cloud for file in files_of(entry, folder)]
     if asked.project.full_resolution:
         refuse_full_disk(files, out)
     _say_if_cold(progress)
     store, room = _store(out, work), Room.of(memory_bytes)
-    _refuse_or_announce(asked, folder, files, room, store.folder, progress)
+    refuse_or_announce(asked, folder, room, store.folder, progress)
     with result_folder(out) as part:
         document = run(asked, folder, part, store=store, progress=progress, room=room)
         _build_report(part, progress)
     store.finish()
     return document
-
-
-def _asked_project(
-    project: Path | None,
-    lidar: Sequence[Path],
-    photogrammetry: Sequence[Path],
-    full_resolution: bool,
-    merge: str | None = None,
-) -> tuple[Project, Path]:
-    """Return the project and the folder that its paths are relative to."""
-    from dougong.pipeline.project import from_files, read_project
-
-    if project is not None and (lidar or photogrammetry):
-        msg = "a project file and --lidar or --photogrammetry were given. Pass one or the other."
-        raise InputError(msg)
-    asked = from_files(lidar, photogrammetry) if project is None else read_project(project)
-    if merge is not None:
-        asked = asked.model_copy(update={"merge": asked.merge.model_copy(update={"mode": merge})})
-    if full_resolution:
-        head = asked.project.model_copy(update={"full_resolution": True})
-        asked = asked.model_copy(update={"project": head})
-    return asked, Path() if project is None else project.parent
-
-
-LONG_SECONDS = 120.0
-"""A run that may take longer is announced with its plan."""
-_QUICK_BYTES = 100_000_000
-
-
-def _refuse_or_announce(
-    project: Project,
-    folder: Path,
-    files: Sequence[Path],
-    room: Room,
-    work: Path,
-    progress: Progress,
-) -> None:
-    """Plan a run whose files are many bytes: refuse what cannot be, say what takes long."""
-    from dougong.pipeline.plan import plan_run, refuse_full_work_disk
-
-    size = sum(file.stat().st_size for file in files if file.is_file())
-    if not room.is_asked and size < _QUICK_BYTES:
-        return  # counting the points of some formats takes a pass over them
-    plan = plan_run(project, folder, room)
-    if plan.refusal is not None:
-        raise InputError(plan.refusal)
-    refuse_full_work_disk(plan, work)
-    if plan.seconds > LONG_SECONDS:
-        progress.note(plan.in_words())
 
 
 def plan(
@@ -337,8 +283,9 @@ def plan(
     """Return what `run_project` would do: ways, memory, disk, time (see `pipeline.plan.Plan`)."""
     from dougong.pipeline.memory import Room
     from dougong.pipeline.plan import plan_run
+    from dougong.pipeline.project import asked_project
 
-    asked, folder = _asked_project(project, lidar, photogrammetry, full_resolution)
+    asked, folder = asked_project(project, lidar, photogrammetry, full_resolution)
     progress.stage("counting points")
     return plan_run(asked, folder, Room.of(memory_bytes)).document()
 
@@ -365,113 +312,20 @@ def demo(
     seed : int
     size : "normal" or "small"
     """
-    from dougong.evaluation.scenes import make_scene
-    from dougong.pipeline.outputs import refuse_existing, result_folder, write_json
-    from dougong.pipeline.project import from_files
-    from dougong.pipeline.run import run
+    from dougong.evaluation.demo import free_folder, refuse_too_large_demo, run_demo
+    from dougong.pipeline.outputs import refuse_existing, result_folder
 
-    folder = _demo_folder(scene) if out is None else _named(out)
+    folder = free_folder(scene) if out is None else _named(out)
     refuse_existing([folder / "result.json"], overwrite)
-    _refuse_large_demo(size, memory_bytes)
+    refuse_too_large_demo(size, memory_bytes)
     _say_if_cold(progress)
     store = _store(folder, work)
     with result_folder(folder) as part:
-        progress.stage(f"surveying the {scene} with a scanner and a drone (seed {seed})")
-        lidar_points, drone_points = DEMO_POINTS[size]
-        made = make_scene(
-            scene, seed, lidar_points=lidar_points, photogrammetry_points=drone_points
+        document = run_demo(
+            scene, part, seed=seed, size=size, shown_as=folder, store=store, progress=progress
         )
-        files = _write_scene(part / "scene", made)
-        plan = from_files([files[0]], [files[1]])
-        plan = plan.model_copy(
-            update={"project": plan.project.model_copy(update={"name": f"Demo: {scene}"})}
-        )
-        result = run(
-            plan,
-            part,
-            part,
-            store=store,
-            progress=progress,
-            shown=lambda path: str(folder / path.relative_to(part.resolve())),
-        )
-        document = _demo_document(scene, seed, result, made.truth, folder)
-        write_json(part / "demo.json", document)
         _build_report(part, progress)
     store.finish()
-    return document
-
-
-DEMO_POINTS = {"normal": (1_000_000, 600_000), "small": (250_000, 150_000)}
-"""Scanner and drone points of a demo scene."""
-
-
-def _demo_folder(scene: str) -> Path:
-    """Return a folder name that is still free."""
-    folder, number = Path(f"dougong-demo-{scene}"), 2
-    while folder.exists():
-        folder, number = Path(f"dougong-demo-{scene}-{number}"), number + 1
-    return folder
-
-
-def _refuse_large_demo(size: str, memory_bytes: int | None) -> None:
-    from dougong.pipeline.memory import estimated_bytes
-
-    need = estimated_bytes(DEMO_POINTS[size])
-    if memory_bytes is not None and need > memory_bytes:
-        msg = (
-            f"the demo needs about {need / 1e9:.1f} GB, more than --memory "
-            f"{memory_bytes / 1e9:.1f} GB. Raise it or pass --size small."
-        )
-        raise InputError(msg)
-
-
-def _write_scene(folder: Path, made: Scene) -> tuple[Path, Path]:
-    """Write a scene's clouds as a survey would deliver them, and its truth beside them."""
-    from dougong.formats import write
-    from dougong.pipeline.outputs import write_json
-
-    folder.mkdir()
-    files = folder / "lidar.laz", folder / "drone.laz"
-    for file, cloud in zip(files, (made.lidar, made.photogrammetry), strict=True):
-        write(cloud, file)
-    truth = made.truth
-    write_json(
-        folder / "truth.json",
-        {"T_target_source": truth.T_target_source.tolist(), "T_best": truth.T_best.tolist()},
-    )
-    return files[0].resolve(), files[1].resolve()
-
-
-def _demo_document(scene: str, seed: int, result: Document, truth: Truth, folder: Path) -> Document:
-    """Return the demo's answer: the status, and the pose's errors against the truth."""
-    from dougong.evaluation.metrics import pose_errors
-
-    matrix = result["registrations"][0]["matrix"]
-    document: Document = {
-        "scene": scene,
-        "seed": seed,
-        "status": result["status"],
-        "rotation_error_deg": None,
-        "tre95_m": None,
-        "bending_floor95_m": None,
-        "total95_m": None,
-        "verdict": "no pose was found",
-        "seconds": result["seconds"]["total"],
-        "peak_memory_bytes": result["peak_memory_bytes"],
-        "report": str(folder / "report.html"),
-    }
-    if matrix is not None:
-        errors = pose_errors(matrix, truth)
-        accurate = "accurate (TRE95 <= 20 mm, rotation <= 0.02 deg)"
-        correct = "correct (TRE95 <= 50 mm)"
-        wrong = "WRONG (TRE95 > 50 mm)"
-        document |= {
-            "rotation_error_deg": errors.rotation_error_deg,
-            "tre95_m": errors.tre95_m,
-            "bending_floor95_m": errors.bending_floor95_m,
-            "total95_m": errors.total95_m,
-            "verdict": accurate if errors.is_accurate else correct if errors.is_correct else wrong,
-        }
     return document
 
 
@@ -505,20 +359,6 @@ def report(folder: Path, *, progress: Progress) -> Document:
     return {"report": str(_build_report(folder, progress))}
 
 
-@dataclass(frozen=True, slots=True)
-class Viewing:
-    """An open viewer: what to say about it, and how to end it."""
-
-    document: Document
-    server: ViewServer
-    scratch: TemporaryDirectory[str]
-
-    def close(self) -> None:
-        """Stop serving and remove the temporary files."""
-        self.server.close()
-        self.scratch.cleanup()
-
-
 def view(
     paths: Sequence[Path],
     *,
@@ -528,47 +368,12 @@ def view(
     progress: Progress,
     pairs: Path | None = None,
 ) -> Viewing:
-    """Serve clouds or result folders to the browser of this computer.
+    """Serve clouds or result folders to the browser; see `dougong.report.viewing.open_view`."""
+    from dougong.report.viewing import open_view
 
-    `pairs` is the CSV file that places picked in two clouds go to.
-
-    Raises
-    ------
-    InputError
-        Nothing is named, a folder holds no result, or the port is taken.
-    FormatError
-        A file cannot be read.
-    """
-    import webbrowser
-
-    from dougong.report.server import ViewServer
-    from dougong.report.streaming import prepare
-
-    if work is not None:
-        work.mkdir(parents=True, exist_ok=True)
-    scratch = TemporaryDirectory(prefix="dougong-view-", dir=work, ignore_cleanup_errors=True)
-    try:
-        scene = prepare(paths, Path(scratch.name), progress.stage, pairs)
-        server = _view_server(ViewServer, scene, port)
-    except BaseException:
-        scratch.cleanup()
-        raise
-    document = {
-        "url": server.url,
-        "clouds": list(scene.clouds),
-        "points": scene.points,
-        "notes": list(scene.notes),
-        "is_browser_open": open_browser and webbrowser.open(server.url),
-    }
-    return Viewing(document, server, scratch)
-
-
-def _view_server(make: type[ViewServer], scene: Shown, port: int) -> ViewServer:
-    try:
-        return make(scene.things, port, scene.takes)
-    except (OSError, OverflowError) as error:
-        msg = f"port {port} cannot be used ({error}). Pass another --port, or none."
-        raise InputError(msg) from error
+    return open_view(
+        paths, port=port, open_browser=open_browser, work=work, progress=progress, pairs=pairs
+    )
 
 
 def _build_report(folder: Path, progress: Progress) -> Path:

@@ -10,9 +10,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from dougong.errors import OutputError
+from dougong.errors import InputError, OutputError
 from dougong.formats import FileInfo, describe
 from dougong.pipeline.memory import Room, estimated_bytes, tiles_bytes
+from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Entry, Project, files_of
 from dougong.threads import get_threads
 from dougong.typing import Kind
@@ -25,6 +26,9 @@ _REPORT_SECONDS = 5.0
 _PARALLEL = 0.8
 """Share of that work which threads divide."""
 
+LONG_SECONDS = 120.0
+"""A run that may take longer is announced with its plan."""
+_QUICK_BYTES = 100_000_000
 _TILE_ROW_BYTES = 32
 _OUT_BYTES_PER_POINT = 12
 """Of compressed points with colour; every kept point is written twice (its cloud, merged)."""
@@ -213,3 +217,25 @@ def refuse_full_work_disk(plan: Plan, work: Path) -> None:
             "Free some space or pass another --work."
         )
         raise OutputError(msg)
+
+
+def refuse_or_announce(
+    project: Project, folder: Path, room: Room, work: Path, progress: Progress
+) -> None:
+    """Plan a run whose files are many bytes: refuse what cannot be, say what takes long.
+
+    Raises
+    ------
+    InputError, OutputError
+        It needs more memory than the user allows, or more disk than there is.
+    """
+    files = [file for entry in project.cloud for file in files_of(entry, folder)]
+    size = sum(file.stat().st_size for file in files if file.is_file())
+    if not room.is_asked and size < _QUICK_BYTES:
+        return  # counting the points of some formats takes a pass over them
+    plan = plan_run(project, folder, room)
+    if plan.refusal is not None:
+        raise InputError(plan.refusal)
+    refuse_full_work_disk(plan, work)
+    if plan.seconds > LONG_SECONDS:
+        progress.note(plan.in_words())

@@ -127,6 +127,32 @@ def read_project(path: Path) -> Project:
     return project
 
 
+def asked_project(
+    project: Path | None,
+    lidar: Sequence[Path],
+    photogrammetry: Sequence[Path],
+    full_resolution: bool,
+    merge: str | None = None,
+) -> tuple[Project, Path]:
+    """Return the project of a command line, and the folder that its paths are relative to.
+
+    Raises
+    ------
+    InputError
+        A project file and clouds are given, or the project is wrong.
+    """
+    if project is not None and (lidar or photogrammetry):
+        msg = "a project file and --lidar or --photogrammetry were given. Pass one or the other."
+        raise InputError(msg)
+    asked = from_files(lidar, photogrammetry) if project is None else read_project(project)
+    if merge is not None:
+        asked = asked.model_copy(update={"merge": asked.merge.model_copy(update={"mode": merge})})
+    if full_resolution:
+        head = asked.project.model_copy(update={"full_resolution": True})
+        asked = asked.model_copy(update={"project": head})
+    return asked, Path() if project is None else project.parent
+
+
 def files_of(entry: Entry, folder: Path) -> list[Path]:
     """Return the files of a cloud, patterns expanded, each once, sorted within a pattern.
 
