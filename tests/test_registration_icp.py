@@ -235,10 +235,24 @@ def test_nothing_in_reach_is_said():
 
 def test_expected_displacement_follows_the_covariance():
     points = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
+    many = 10_000
     slides = np.zeros((6, 6))
     slides[3, 3] = 0.01**2
-    assert covariance.displacement95(slides, np.zeros(3), points) == pytest.approx(0.0196)
+    found = covariance.displacement95(slides, np.zeros(3), points, many)
+    assert found == pytest.approx(0.0196, rel=0.05)
     turns = np.zeros((6, 6))
     turns[2, 2] = 0.001**2
     # One milliradian about z moves a point 10 m away by 10 mm.
-    assert covariance.displacement95(turns, np.zeros(3), points[1:]) == pytest.approx(0.0196)
+    found = covariance.displacement95(turns, np.zeros(3), points[1:], many)
+    assert found == pytest.approx(0.0196, rel=0.05)
+    # In three directions the length is a chi of three: 2.80 sigma, not 1.96.
+    every = np.diag([0.0, 0.0, 0.0, 1e-4, 1e-4, 1e-4])
+    found = covariance.displacement95(every, np.zeros(3), points, many)
+    assert found == pytest.approx(0.0280, rel=0.05)
+
+
+def test_few_blocks_widen_the_expected_displacement_by_students_t():
+    slides = np.zeros((6, 6))
+    slides[3, 3] = 0.01**2 * (16 - 1) / (16 - 8)
+    found = covariance.displacement95(slides, np.zeros(3), np.zeros((1, 3)), 16)
+    assert found == pytest.approx(0.0213, rel=0.06)

@@ -157,6 +157,9 @@ class Cloud:
     """What the format that read the cloud needs to write it again; opaque here."""
     motion: Transform | None = None
     """(4, 4) what `moved` did so far, between file coordinates; None: as the file has it."""
+    viewpoints: NDArray[np.float64] | None = None
+    """(k, 3) metres, local frame: where the scanner stood. The attribute `station` is the row of
+    each point; without it row 0 is every point's. NaN rows, or None: unknown."""
     notes: tuple[str, ...] = ()
     """What was handled while reading, in words and counted ("12 rows with NaN dropped")."""
 
@@ -290,6 +293,7 @@ class Cloud:
             linear @ self.frame.origin + np.asarray(target.unit_m) * matrix[:3, 3] - target.origin
         )
         xyz = transformed(self.xyz, linear, shift)
+        seen_from = None if self.viewpoints is None else self.viewpoints @ linear.T + shift
         step = _step_in(self.frame, target, float(np.cbrt(np.linalg.det(linear))))
         return replace(
             self,
@@ -297,9 +301,15 @@ class Cloud:
             records=_turned(self.records, matrix[:3, :3]),
             frame=replace(target, step=step),
             motion=matrix if self.motion is None else matrix @ self.motion,
+            viewpoints=seen_from,
         )
 
     def rebased(self, origin: NDArray[np.float64]) -> Cloud:
         """Return the same points in local coordinates about another `origin` (3,), metres."""
         shift = self.frame.origin - origin
-        return replace(self, xyz=self.xyz + shift, frame=replace(self.frame, origin=origin))
+        return replace(
+            self,
+            xyz=self.xyz + shift,
+            frame=replace(self.frame, origin=origin),
+            viewpoints=None if self.viewpoints is None else self.viewpoints + shift,
+        )

@@ -44,6 +44,7 @@ def make_scene(
     bending: bool = True,
     outliers: float = 0.015,
     site: bool = True,
+    woods: bool = False,
     max_tilt_deg: float = 0.6,
     scanner: scanners.Scanner | None = None,
     drone: drones.Drone | None = None,
@@ -65,6 +66,8 @@ def make_scene(
     site : bool
         False: the building alone, as symmetric as its kind can be, on level ground, with nothing
         that breaks its symmetry (a truly ambiguous pair, where its kind is symmetric).
+    woods : bool
+        True: tall trees stand all round, up to the walls; their leaves differ between the surveys.
     max_tilt_deg : float
         The scanner frame is off level by up to this.
     scanner, drone : Scanner, Drone, optional
@@ -80,7 +83,7 @@ def make_scene(
     if kind not in BUILDERS:
         msg = f"there is no scene {kind!r}. Take one of {', '.join(get_args(SceneKind))}."
         raise InputError(msg)
-    world, tracer = _world(kind, seed, site)
+    world, tracer = _world(kind, seed, site, woods)
     surveyor = (scanner or scanners.Scanner()).model_copy(
         update={"points": lidar_points, "outliers": outliers}
     )
@@ -90,7 +93,7 @@ def make_scene(
     return survey(kind, seed, world, surveyor, pilot, bending, max_tilt_deg, tracer, on_map)
 
 
-def _world(kind: str, seed: int, site: bool) -> tuple[World, Tracer]:
+def _world(kind: str, seed: int, site: bool, woods: bool) -> tuple[World, Tracer]:
     """Return what the sensors meet, and the tracer of its still part."""
     building = BUILDERS[kind](stream(seed, f"{kind} building"), is_symmetric=not site)
     if not site:
@@ -102,7 +105,7 @@ def _world(kind: str, seed: int, site: bool) -> tuple[World, Tracer]:
     extras = [join([]), join([])]
     if site:
         static.append(sites.furniture(building, terrain, rng))
-        trees = sites.tree_places(building, terrain, rng, reach)
+        trees = sites.tree_places(building, terrain, rng, reach, woods)
         static.append(sites.trunks(trees))
         for k, epoch in enumerate(("scan", "flight")):
             drawn = stream(seed, f"{kind} {epoch}")
@@ -143,6 +146,7 @@ def scan_mesh(
     face_labels: ArrayLike | None = None,
     stations: ArrayLike | int = 8,
     ground: bool = True,
+    woods: bool = False,
     lidar_points: int = 1_000_000,
     photogrammetry_points: int = 600_000,
     bending: bool = True,
@@ -166,6 +170,8 @@ def scan_mesh(
         How many scanner positions to find, or the positions, in the mesh's coordinates.
     ground : bool
         Lay gently rolling ground under and round the mesh, at its foot.
+    woods : bool
+        Plant tall trees all round; needs `ground`. Their leaves differ between the surveys.
     lidar_points, photogrammetry_points, bending, outliers, max_tilt_deg, scanner, drone, on_map
         As for `make_scene`.
 
@@ -182,12 +188,17 @@ def scan_mesh(
     plain = Mesh.of(points - middle, triangles, "plaster")
     mesh = Mesh(plain.vertices, plain.faces, labels, plain.materials)
     given = np.asarray(stations, dtype=np.float64)
+    if woods and not ground:
+        msg = "woods=True with ground=False: trees need ground to stand on. Pass ground=True."
+        raise InputError(msg)
     world, tracer = _world_of_mesh(
         mesh,
         int(given) if given.ndim == 0 else as_points(given - middle, "stations"),
         ground,
         stream(seed, f"{name} site"),
     )
+    if woods:
+        world, tracer = _planted(world, mesh, name, seed)
     update = {"outliers": outliers}
     surveyor = (scanner or scanners.Scanner()).model_copy(update={"points": lidar_points, **update})
     pilot = (drone or drones.Drone()).model_copy(update={"points": photogrammetry_points, **update})
@@ -203,9 +214,7 @@ def _world_of_mesh(
     reach = float(half.max()) + 25.0
     static = mesh
     if ground:
-        shape = Building(
-            mesh=mesh, stations=np.zeros((1, 3)), half=(float(half[0]) + 1, float(half[1]) + 1)
-        )
+        shape = _shape_of(mesh, np.zeros((1, 3)))
         terrain = sites.draw_terrain(shape, rng, is_flat=False)
         # Just under the mesh's own ground, if it has one.
         bare = sites.ground(terrain, reach, shape).turned(0.0, (0.0, 0.0, -0.03))
@@ -223,6 +232,25 @@ def _world_of_mesh(
         top=float(high[2]),
     )
     return world, tracer
+
+
+def _shape_of(mesh: Mesh, stations: Points) -> Building:
+    low, high = mesh.extent()
+    half = (high - low)[:2] / 2
+    return Building(mesh=mesh, stations=stations, half=(float(half[0]) + 1, float(half[1]) + 1))
+
+
+def _planted(world: World, mesh: Mesh, name: str, seed: int) -> tuple[World, Tracer]:
+    """Return the world of a mesh with trees all round it, and the tracer of its still part."""
+    shape = _shape_of(mesh, world.stations)
+    # The ground is drawn first from this stream: the same ground as the world's own.
+    terrain = sites.draw_terrain(shape, stream(seed, f"{name} site"), is_flat=False)
+    rng = stream(seed, f"{name} trees")
+    trees = sites.tree_places(shape, terrain, rng, world.reach, is_wooded=True)
+    static = join([world.static, sites.trunks(trees)])
+    leaves = [sites.foliage(trees, stream(seed, f"{name} {epoch}")) for epoch in ("scan", "flight")]
+    planted = replace(world, static=static, during_scan=leaves[0], during_flight=leaves[1])
+    return planted, Tracer(static)
 
 
 def _foot(points: Points) -> float:

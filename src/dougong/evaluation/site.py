@@ -180,23 +180,36 @@ def furniture(building: Building, terrain: Terrain, rng: np.random.Generator) ->
 
 
 def tree_places(
-    building: Building, terrain: Terrain, rng: np.random.Generator, reach: float
+    building: Building,
+    terrain: Terrain,
+    rng: np.random.Generator,
+    reach: float,
+    is_wooded: bool = False,
 ) -> Floats:
-    """Draw where the trees stand: x, y, ground height and tree height, (k, 4)."""
+    """Draw where the trees stand: x, y, ground height and tree height, (k, 4).
+
+    `is_wooded`: five times as many and taller, up to the walls and over the paths, as round a
+    temple in a wood.
+    """
     hx, hy = building.half
+    most, apart, off, tries = (55, 3.5, 1.0, 1500) if is_wooded else (11, 6.5, 5.0, 200)
+    low, tall = (7.0, 14.0) if is_wooded else (5.0, 11.0)
     found: list[tuple[float, float, float, float]] = []
-    for _ in range(200):
+    for _ in range(tries):
         x, y = rng.uniform(-reach * 0.75, reach * 0.75, 2)
-        is_near = abs(x) < hx + 5 and abs(y) < hy + 5
-        is_path = abs(x) < 6 and y < 0
+        is_near = abs(x) < hx + off and abs(y) < hy + off
+        is_path = abs(x) < (1.5 if is_wooded else 6) and y < 0
         is_rock = building.back is not None and y > building.back - 6
-        is_house = hx + 3 < abs(x) < hx + 19 and -22 < y < 10
-        close = any(np.hypot(x - a, y - b) < 6.5 for a, b, _, _ in found)
-        at_station = np.hypot(building.stations[:, 0] - x, building.stations[:, 1] - y).min() < 5
+        is_house = hx + 3 < abs(x) < hx + 19 and -22 < y < 10 and not is_wooded
+        close = any(np.hypot(x - a, y - b) < apart for a, b, _, _ in found)
+        to_station = np.hypot(building.stations[:, 0] - x, building.stations[:, 1] - y).min()
+        at_station = to_station < (2.5 if is_wooded else 5)
         if is_near or is_path or is_rock or is_house or close or at_station:
             continue
-        found.append((x, y, float(terrain.height(np.array(x), np.array(y))), rng.uniform(5, 11)))
-        if len(found) == 11:
+        found.append(
+            (x, y, float(terrain.height(np.array(x), np.array(y))), rng.uniform(low, tall))
+        )
+        if len(found) == most:
             break
     return np.array(found).reshape(-1, 4)
 

@@ -150,10 +150,15 @@ def _merged_stations(clouds: Sequence[Cloud], path: Path) -> Cloud:
     notes = [f"{cloud.name}: {note}" for cloud in clouds for note in cloud.notes]
     notes += [f"{name} is 0 for stations without it." for name in sorted(missing)]
     headers = tuple(cloud.header for cloud in clouds)
+    places = np.full((1 + max(cloud.header.station for cloud in clouds), 3), np.nan)
+    for cloud in clouds:
+        if cloud.viewpoints is not None:
+            places[cloud.header.station] = cloud.viewpoints[0]
     return replace(
         clouds[0],
         xyz=xyz,
         records=records,
+        viewpoints=places,
         name=stem_of(path),
         header=replace(headers[0], stations=headers),
         notes=tuple(notes),

@@ -241,8 +241,18 @@ def _make(scan: Scan, lattice: Lattice, records: Records, coordinates: Points, n
         name=scan.name,
         bits=scan.bits,
         header=scan.header,
+        viewpoints=_viewpoints(scan.header, lattice.frame),
         notes=(*scan.notes, *unit_notes(lattice.frame), *notes),
     )
+
+
+def _viewpoints(header: Any, frame: Frame) -> NDArray[np.float64] | None:
+    """Return where the scanner stood, (1, 3) local, if the file says where its scan was put."""
+    place = getattr(header, "translation", None)
+    # Exports without a pose leave zeros, wherever the scanner was.
+    if place is None or not np.any(place):
+        return None
+    return frame.to_local(np.asarray(place, dtype=np.float64)[None])
 
 
 def survey_of(scans: Iterable[Scan], rows: int) -> Survey:

@@ -21,6 +21,8 @@ _FACING = 0.3
 _LEAST_FACING_SHARE = 0.004
 _LEAST_FACING_BLOCKS = 3
 _LOOSE_SIGMA_M = 0.05
+_DRAWS = 1000
+_DRAWN_POINTS = 400
 
 
 def blocks_of(points: Points, size_m: float) -> tuple[Index, int]:
@@ -40,16 +42,19 @@ def jackknife(
     dof: int,
     length_m: float,
     block_m: float,
-) -> NDArray[np.float64] | None:
-    """Return the (6, 6) covariance of (omega, v) about `centre` by leaving blocks out.
+) -> tuple[NDArray[np.float64] | None, int]:
+    """Return the (6, 6) covariance of (omega, v) about `centre`, and its number of blocks.
+
+    Blocks are left out one by one.
 
     Errors of neighbouring points, and of a bending cloud, go together: what a whole block pulls
     is one observation. Blocks of 1, 2 and 4 times `block_m` are tried where at least 14 of them
     hold points, and the largest answer counts, since bending is slower than any one block; for
     small objects the block shrinks instead. Widened by (b - 1) / (b - 8), so that the expected
-    squared error in units of the covariance is right for b blocks. None: too few blocks.
+    squared error in units of the covariance is right for b blocks. None, 0: too few blocks.
     """
     best: NDArray[np.float64] | None = None
+    blocks = 0
     scale = np.array([length_m] * 3 + [1.0] * 3)
     for growth in _BLOCK_GROWTH:
         block, count = blocks_of(pairs.points, block_m * growth)
@@ -64,8 +69,8 @@ def jackknife(
         covariance = (count - 1) / count * steps.T @ steps * ((count - 1) / (count - 8))
         size = np.trace(covariance * np.outer(scale, scale))
         if best is None or size > np.trace(best * np.outer(scale, scale)):
-            best = covariance
-    return best
+            best, blocks = covariance, count
+    return best, blocks
 
 
 def unobservable(
@@ -150,20 +155,19 @@ def _axis(vector: NDArray[np.float64]) -> str:
 
 
 def displacement95(
-    covariance: NDArray[np.float64], centre: NDArray[np.float64], points: Points
+    covariance: NDArray[np.float64], centre: NDArray[np.float64], points: Points, blocks: int
 ) -> float:
-    """Return the 95 % displacement, metres, that a pose's covariance expects at `points` (n, 3).
+    """Return the TRE95 that 95 % of the poses stay below which the data allow, metres.
 
-    1.96 sigma of the whole displacement at each point (exact where one direction is weak, else
-    cautious), at the 95th percentile of the points.
+    Poses are drawn from the jackknife's own distribution, Student's t with `blocks` - 1 degrees
+    of freedom (`covariance` without its widening); TRE95 is the 95 % displacement of `points`
+    (n, 3). The draws are the same for every call, so that the answer is a function of the data.
     """
-    arms = points - centre
-    # d(omega x arm + v) / d(omega, v) = [-[arm]x, I]
-    J = np.zeros((len(arms), 3, 6))
-    for axis in range(3):
-        first, second = (axis + 1) % 3, (axis + 2) % 3
-        J[:, axis, first] = arms[:, second]
-        J[:, axis, second] = -arms[:, first]
-        J[:, axis, 3 + axis] = 1.0
-    variance = np.einsum("nij,jk,nik->n", J, covariance, J)
-    return float(1.96 * np.sqrt(np.quantile(np.clip(variance, 0.0, None), 0.95)))
+    rng = np.random.default_rng(0)
+    values, vectors = np.linalg.eigh(covariance * (blocks - 8) / (blocks - 1))
+    draws = rng.normal(size=(_DRAWS, 6)) * np.sqrt(np.clip(values, 0.0, None)) @ vectors.T
+    draws /= np.sqrt(rng.chisquare(blocks - 1, (_DRAWS, 1)) / (blocks - 1))
+    arms = (points - centre)[:: max(1, len(points) // _DRAWN_POINTS)]
+    motion = np.cross(draws[:, None, :3], arms[None]) + draws[:, None, 3:]
+    tre95 = np.quantile(np.linalg.norm(motion, axis=2), 0.95, axis=1)
+    return float(np.quantile(tre95, 0.95))

@@ -33,7 +33,14 @@ _OUTSIDE = 0.8
 _AWAY_M = 0.5
 _AWAY_UP_M = 0.3
 _AWAY_SPACINGS = 2.0
+# A surface is left by a shift that it faces within 60 degrees ...
+_FACING_COSINE = 0.5
+# ... and a direction that less than this share of the structure faces is not asked about:
+# whether it is held at all is what `covariance.unobservable` says.
+_LEAST_FACING = 0.02
 _VIOLATION = 1.5
+# No roof or floor is thicker: what lies deeper below a top is not its underside.
+_THICKEST_M = 0.4
 _ABOVE_TOP_M = 0.75
 _NORMAL_COSINE = float(np.cos(np.radians(45.0)))
 
@@ -62,6 +69,12 @@ class Witness:
 
     points: Points
     normals: Points
+    is_oriented: Mask
+    """(n,) the normal's sign is sure."""
+    is_top: Mask
+    """(n,) surely seen from above."""
+    may_be_underside: Mask
+    """(n,) of a roof of which nobody knows the side."""
     weights: Values
     """(n,) square metres, flat ones more, ground a tenth: flat ground agrees with any pose."""
     is_structure: Mask
@@ -126,6 +139,9 @@ def _witness(prepared: Prepared) -> Witness:
     return Witness(
         points=prepared.xyz[heard],
         normals=prepared.normals[heard],
+        is_oriented=everything.is_oriented[everything.asked],
+        is_top=everything.is_top[everything.asked],
+        may_be_underside=everything.may_be_underside[everything.asked],
         weights=area * np.square(planarity) * np.where(is_ground, _GROUND_SHARE, 1.0),
         is_structure=(planarity > 0.7) & ~is_ground,
         everything=everything,
@@ -182,7 +198,18 @@ def _hear_one(
     along = np.abs(np.einsum("ij,ij->i", normals, offset))
     # Either plane may be the noisy one: the smaller distance is the fairer.
     error = np.maximum(np.minimum(across, along), distance - to.slack[index] - tolerance_m)
-    is_alike = do_agree(normals, other, False, _NORMAL_COSINE)
+    # An underside lies below its top by the roof's thickness, whatever that is.
+    for is_slab, up, sign in (
+        (from_.may_be_underside & to.everything.is_top[index], other, 1.0),
+        (from_.is_top & to.everything.may_be_underside[index], normals, -1.0),
+    ):
+        above = sign * np.einsum("ij,ij->i", up, offset)
+        aside = np.sqrt(np.clip(distance**2 - above**2, 0.0, None))
+        apart = np.maximum(above, -above - _THICKEST_M)
+        slab = np.maximum(apart, aside - to.slack[index] - tolerance_m)
+        error = np.where(is_slab, np.clip(slab, 0.0, None), error)
+    is_oriented = from_.is_oriented & to.everything.is_oriented[index]
+    is_alike = do_agree(normals, other, is_oriented, _NORMAL_COSINE)
     error = np.where(is_near & is_alike, error, np.inf)
     is_inside, top = to.plan.at(moved)
     loss = np.where(is_inside, np.clip((error - tolerance_m) / _RAMP_M, 0.0, 1.0), _OUTSIDE)
@@ -223,26 +250,40 @@ def violation(court: Court, testimony: Testimony) -> float:
 def sharpness(court: Court, testimony: Testimony) -> float:
     """Return how many times more structure a pose explains than the poses 0.6 m around it.
 
-    The largest of eight neighbours counts, half a metre away in plan and 0.3 m up or down (less
-    for small objects, more for clouds whose points lie farther apart than 0.25 m). Two clouds of
-    different places fit equally badly everywhere: about 1. Sensors that show little in common
-    lower what is explained at the pose and beside it alike.
+    The least of eight ratios, one per neighbour half a metre away in plan and 0.3 m up or down
+    (less for small objects, more for clouds whose points lie farther apart than 0.25 m). Each
+    counts only the structure that faces the way to that neighbour: a wall slid along itself is
+    explained as before, and says nothing. Two clouds of different places fit equally badly
+    everywhere: about 1. Sensors that show little in common lower what is explained at the pose
+    and beside it alike.
     """
     weights = structure_weights(court)
+    total = float(weights.sum())
+    normals = np.vstack([court.source.normals @ testimony.T[:3, :3].T, court.target.normals])
+    ratios = []
+    for offset in _offsets(court):
+        facing = np.abs(normals @ offset) > _FACING_COSINE * np.linalg.norm(offset)
+        asked = weights * facing
+        # Chance explains a few percent anywhere: ratios of less mean nothing.
+        floor = 0.02 * float(asked.sum())
+        if floor <= 0.02 * _LEAST_FACING * total:
+            continue
+        away = testimony.T.copy()
+        away[:3, 3] += offset
+        beside = float(asked @ hear(court, away).is_explained)
+        ratios.append(float(asked @ testimony.is_explained) / max(beside, floor))
+    return min(ratios, default=0.0)
+
+
+def _offsets(court: Court) -> list[NDArray[np.float64]]:
+    """Return the ways (3,) to the eight poses that a pose is held against."""
     size = float(np.ptp(court.source.points, axis=0).max())
     scale = min(1.0, max(size / 20.0, 6.0 * court.tolerance_m) / _AWAY_M)
     # What a thin cloud shows reaches as far as its points lie apart: look beyond that.
     spacing = max(court.source.everything.spacing_m, court.target.everything.spacing_m)
     scale = max(scale, _AWAY_SPACINGS * spacing / _AWAY_M)
-    around = 0.0
-    for k in range(8):
-        away = testimony.T.copy()
-        turn = k * np.pi / 4.0
-        away[:3, 3] += scale * np.array(
-            [_AWAY_M * np.cos(turn), _AWAY_M * np.sin(turn), _AWAY_UP_M * (-1.0) ** k]
-        )
-        around = max(around, float(weights @ hear(court, away).is_explained))
-    here = float(weights @ testimony.is_explained)
-    # Chance explains a few percent anywhere: ratios of less mean nothing.
-    floor = 0.02 * float(weights.sum())
-    return here / max(around, floor, 1e-300)
+    turns = np.arange(8) * (np.pi / 4.0)
+    return [
+        scale * np.array([_AWAY_M * np.cos(t), _AWAY_M * np.sin(t), _AWAY_UP_M * (-1.0) ** k])
+        for k, t in enumerate(turns)
+    ]

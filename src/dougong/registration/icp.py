@@ -268,12 +268,12 @@ def _result(
     )
     is_enough = len(pairs.residuals) >= _LEAST_PAIRS
     centre = level.target.xyz.mean(axis=0)
-    covariance, rmse, fitness = None, float("nan"), 0.0
+    covariance, blocks, rmse, fitness = None, 0, float("nan"), 0.0
     loose: tuple[Mapping[str, Any], ...] = ()
     if is_enough:
         weights, _ = _weights(pairs, level, params)
         centre, length = centre_and_length(pairs, weights)
-        covariance = jackknife(pairs, weights, centre, params.dof, length, params.block_m)
+        covariance, blocks = jackknife(pairs, weights, centre, params.dof, length, params.block_m)
         loose = unobservable(pairs, weights, centre, params.dof, length, params.block_m)
         is_inlier = weights > 0.0
         rmse = _rms(_distance(pairs, params)[is_inlier], pairs.weights[is_inlier])
@@ -290,6 +290,7 @@ def _result(
         overlap_target=overlap_share(level.target, level.source, inverse(T), level.bound_m),
         covariance=covariance,
         covariance_about=centre,
+        covariance_blocks=blocks,
         unobservable=loose,
         history=tuple(history),
     )

@@ -20,6 +20,8 @@ from dougong.typing import Index, Mask, Points, Transform, Values
 
 _GROWTH = 1.3
 _FEWEST = 1000
+_TOP = 0.5
+"""A surface seen from above faces within 60 degrees of the vertical."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,7 +36,12 @@ class Rung:
     """(n,) square metres of surface that each point stands for."""
     index: Index
     """(n,) which points of the prepared cloud these are."""
-    is_oriented: bool
+    is_oriented: Mask
+    """(n,) the normal's sign is sure."""
+    is_top: Mask
+    """(n,) surely seen from above."""
+    may_be_underside: Mask
+    """(n,) of a roof of which nobody knows the side."""
     spacing_m: float
     sigma_m: float
     tree: Any
@@ -129,14 +136,19 @@ def _build_rung(prepared: Prepared, chosen: _Thinned, few: _Thinned) -> Rung:
     # A voxel's point stands for its voxel's share of surface, whatever the cloud's density.
     area = np.clip(prepared.weights_area[index], 0.0, None)
     area = np.minimum(area / max(float(np.median(area)), 1e-12), 3.0) * spacing**2
+    count = len(prepared.xyz)
+    is_oriented = np.broadcast_to(prepared.normal_is_oriented, count)[index]
+    normals = np.ascontiguousarray(prepared.normals[index])
     return Rung(
         xyz=xyz,
-        normals=np.ascontiguousarray(prepared.normals[index]),
+        normals=normals,
         weights=area * np.square(np.clip(prepared.planarity[index], 0.05, 1.0)),
         area=area,
         index=index,
         asked=np.flatnonzero(np.isin(index, few.index)),
-        is_oriented=bool(prepared.normal_is_oriented),
+        is_oriented=is_oriented,
+        is_top=is_oriented & (normals @ prepared.up > _TOP),
+        may_be_underside=np.broadcast_to(prepared.may_be_underside, count)[index],
         spacing_m=spacing,
         sigma_m=float(prepared.sigma_m),
         # Cut at the middle instead of the median: built three times as fast, asked as fast.
@@ -166,10 +178,10 @@ def nearest(tree: Any, queries: Points, bound_m: float) -> tuple[Values, Index]:
     return distance, index.astype(np.int64)
 
 
-def do_agree(a: Points, b: Points, is_oriented: bool, cosine: float) -> Mask:
-    """Say whether normals (k, 3) point the same way, or the same or opposite way."""
+def do_agree(a: Points, b: Points, is_oriented: Mask, cosine: float) -> Mask:
+    """Say whether normals (k, 3) point the same way; or opposite, where not `is_oriented` (k,)."""
     dot = np.einsum("ij,ij->i", a, b)
-    agreeing: Mask = (dot if is_oriented else np.abs(dot)) > cosine
+    agreeing: Mask = np.where(is_oriented, dot, np.abs(dot)) > cosine
     return agreeing
 
 
@@ -195,8 +207,8 @@ def find_pairs(
         hit = np.isfinite(distance)
         s, t = np.concatenate([s, to[hit]]), np.concatenate([t, target.asked[hit]])
     a, b = source.normals[s] @ T[:3, :3].T, target.normals[t]
-    is_oriented = source.is_oriented and target.is_oriented
-    keep = do_agree(a, b, is_oriented, cosine)
+    is_oriented = source.is_oriented[s] & target.is_oriented[t]
+    keep = do_agree(a, b, is_oriented, cosine) & ~_are_of_a_slab(source, target, s, t)
     s, t, a, b = s[keep], t[keep], a[keep], b[keep]
     normals = _mean_normals(a, b, source.sigma_m, target.sigma_m)
     moved = apply(T, source.xyz[s])
@@ -210,6 +222,12 @@ def find_pairs(
         offsets=offsets,
         weights=np.sqrt(source.weights[s] * target.weights[t]),
     )
+
+
+def _are_of_a_slab(source: Rung, target: Rung, s: Index, t: Index) -> Mask:
+    """Say which pairs may be the two sides of one roof: a top, and what may be an underside."""
+    one: Mask = source.may_be_underside[s] & target.is_top[t]
+    return one | (target.may_be_underside[t] & source.is_top[s])
 
 
 def _mean_normals(a: Points, b: Points, sigma_a: float, sigma_b: float) -> Points:

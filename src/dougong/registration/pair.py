@@ -376,7 +376,9 @@ def _judged(
     if status == "ok" and fine.covariance is not None:
         explained = final.is_explained[: len(court.source.points)]
         shared = apply(final.T, court.source.points[explained])
-        spread = displacement95(fine.covariance, fine.covariance_about, shared)
+        spread = displacement95(
+            fine.covariance, fine.covariance_about, shared, fine.covariance_blocks
+        )
         limit = params.verdict.most_spread_m
         if spread > limit:
             return "ambiguous", (

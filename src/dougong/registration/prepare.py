@@ -15,6 +15,7 @@ from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid
 from dougong.params import Parameters
 from dougong.registration.cleaning import extent, far_points, isolated_points, sensor_noise
 from dougong.registration.levelling import Levelling, levelling, rotation_to_vertical
+from dougong.registration.orientation import sides, sights
 from dougong.registration.surface import surface
 from dougong.typing import Index, Kind, Mask, Points, Values
 
@@ -52,8 +53,9 @@ class Prepared:
     """(n, 3) metres, in the local frame of the cloud it was made from."""
     normals: Points
     """(n, 3) unit."""
-    normal_is_oriented: bool
-    """True: normals point out of the solid; False: their sign means nothing."""
+    normal_is_oriented: Mask | bool
+    """(n,), or one for all. True: the normal points to the side that was seen, see `orientation`;
+    False: its sign means nothing."""
     planarity: Values
     """(n,) 1 - 3 l3 / (l1 + l2 + l3) of the local plane: 1 is a plane."""
     is_ground: Mask
@@ -67,6 +69,8 @@ class Prepared:
     sigma_m: float
     """Noise of one measured point across its surface (one standard deviation)."""
     kind: Kind
+    may_be_underside: Mask | bool = False
+    """(n,), or one for all: a roof overhead of which nobody knows the side, see `orientation`."""
     has_ground: bool = True
     levelling: Levelling = field(default_factory=Levelling)
     """What the walls say about z; `levelling.up` is trusted only where `is_relevelled`."""
@@ -115,10 +119,23 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
     level = xyz @ rotation_to_vertical(upright.up).T if is_relevelled else xyz
     ground = _ground(level, sigma, params, notes)
     stays = ground.stays
+    up = upright.up if is_relevelled else np.array([0.0, 0.0, 1.0])
+    seen = sides(
+        plane.normals,
+        xyz,
+        plane.planarity,
+        ground.height if ground.is_found else np.full(len(xyz), np.nan),
+        ground.is_ground,
+        up,
+        kind,
+        spacing,
+        sights(cloud, kept),
+    )
     return Prepared(
         xyz=np.ascontiguousarray(xyz[stays]),
-        normals=plane.normals[stays],
-        normal_is_oriented=False,
+        normals=seen.normals[stays],
+        normal_is_oriented=seen.is_sure[stays],
+        may_be_underside=seen.may_be_underside[stays],
         planarity=plane.planarity[stays],
         is_ground=ground.is_ground[stays],
         height_above_ground=ground.height[stays],

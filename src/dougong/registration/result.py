@@ -51,6 +51,8 @@ class FineResult:
     """(6, 6) of (omega rad, v m) about `covariance_about`, block jackknife; None: unknown."""
     covariance_about: NDArray[np.float64]
     """(3,), local target coordinates."""
+    covariance_blocks: int = 0
+    """Independent blocks of surface behind `covariance`; 0 where it is None."""
     unobservable: tuple[Mapping[str, Any], ...] = ()
     """Directions the data do not fix: {"vector": 6 numbers, "text": words}."""
     history: tuple[Mapping[str, float], ...] = ()

@@ -26,6 +26,9 @@ _SHIFT_STEP_M = 0.25
 _REACH_M = 1.0
 # Of what the winner itself reaches in the quick score, a pose worth refining reaches so much.
 _WORTH = 0.4
+_NEAR_REACH_M = 0.3
+_NEAR_STEP_M = 0.05
+_NEAR_WORTH = 0.5
 
 
 def is_same(a: Transform, b: Transform, at: NDArray[np.float64]) -> bool:
@@ -82,6 +85,52 @@ def propose_rivals(court: Court, winner: Testimony, most: int) -> list[Transform
     return [move @ winner.T for move in rivals]
 
 
+def propose_neighbours(court: Court, winner: Testimony, most: int) -> list[Transform]:
+    """Return starting poses close to the winner's where a fit may have come to rest as well.
+
+    A roof's underside on its top, the next step of a stair, the next bar of a lattice: peaks of
+    the quick score, with a short reach, over shifts of up to 1 m in height and 0.6 m along both
+    axes of the structure, and turns of up to 6 degrees.
+    """
+    if int(court.source.is_structure.sum()) < 50 or int(court.target.is_structure.sum()) < 50:
+        return []
+    structure = apply(winner.T, court.source.points[court.source.is_structure])
+    normals = court.source.normals[court.source.is_structure] @ winner.T[:3, :3].T
+    middle, axes = middle_of(structure), _plan_axes(structure)
+    step = max(1, len(structure) // _SAMPLE)
+    structure, normals = structure[::step], normals[::step]
+    worth = _NEAR_WORTH * _quick_score(court, np.eye(4), structure, normals, _NEAR_REACH_M)
+    found: list[tuple[float, Transform]] = []
+    for family in _near_families(middle, axes):
+        scores = np.array(
+            [_quick_score(court, move, structure, normals, _NEAR_REACH_M) for move in family]
+        )
+        found += [(scores[k], family[k]) for k in _peaks(scores) if scores[k] > worth]
+    found.sort(key=lambda item: -item[0])
+    return [move @ winner.T for _, move in found[:most]]
+
+
+def _near_families(middle: NDArray[np.float64], axes: NDArray[np.float64]) -> list[list[Transform]]:
+    """Return small shifts up, down and both ways along `axes` (2, 2), and turns both ways."""
+    ways = [(np.array([0.0, 0.0, 1.0]), 1.0), *((np.array([*axis, 0.0]), 0.6) for axis in axes)]
+    families = []
+    for sign in (1.0, -1.0):
+        for way, reach in ways:
+            steps = sign * np.arange(_NEAR_STEP_M, reach + 0.5 * _NEAR_STEP_M, _NEAR_STEP_M)
+            families.append([_motion(0.0, step * way, middle) for step in steps])
+        turns = sign * np.radians(np.arange(0.5, 6.25, 0.5))
+        families.append([_motion(turn, np.zeros(3), middle) for turn in turns])
+    return families
+
+
+def _motion(turn: float, shift: NDArray[np.float64], middle: NDArray[np.float64]) -> Transform:
+    """Return the turn (rad) about the vertical through `middle`, then the shift (3,)."""
+    move = np.eye(4)
+    move[:3, :3] = rotation_of(np.array([0.0, 0.0, turn]))
+    move[:3, 3] = middle - move[:3, :3] @ middle + shift
+    return move
+
+
 def propose_mirrored(court: Court, winner: Testimony, most: int) -> list[Transform]:
     """Return poses (improper, source -> target) that lay the source's mirror image on the target.
 
@@ -134,21 +183,22 @@ def _reflections(middle: NDArray[np.float64]) -> list[Transform]:
 
 def _turns(middle: NDArray[np.float64]) -> list[Transform]:
     """Return the turns about the vertical through `middle`, 10 to 350 degrees."""
-    moves = []
-    for angle in np.arange(2 * _TURN_STEP_DEG, 360.0 - _TURN_STEP_DEG, _TURN_STEP_DEG):
-        move = np.eye(4)
-        move[:3, :3] = rotation_of(np.array([0.0, 0.0, np.radians(angle)]))
-        move[:3, 3] = middle - move[:3, :3] @ middle
-        moves.append(move)
-    return moves
+    angles = np.arange(2 * _TURN_STEP_DEG, 360.0 - _TURN_STEP_DEG, _TURN_STEP_DEG)
+    return [_motion(float(np.radians(angle)), np.zeros(3), middle) for angle in angles]
+
+
+def _plan_axes(points: Points) -> NDArray[np.float64]:
+    """Return the two axes (2, 2), by rows, along which the plan of `points` spreads."""
+    centred = points[:, :2] - points[:, :2].mean(axis=0)
+    axes: NDArray[np.float64] = np.linalg.eigh(centred.T @ centred)[1].T
+    return axes
 
 
 def _shifts(points: Points) -> list[list[Transform]]:
     """Return the shifts both ways along both axes of the structure's plan."""
     centred = points[:, :2] - points[:, :2].mean(axis=0)
-    _, axes = np.linalg.eigh(centred.T @ centred)
     families = []
-    for axis in axes.T:
+    for axis in _plan_axes(points):
         along = centred @ axis
         half = 0.5 * float(np.quantile(along, 0.99) - np.quantile(along, 0.01))
         steps = np.arange(2 * _SHIFT_STEP_M, max(min(half, 20.0), 1.0), _SHIFT_STEP_M)
@@ -192,7 +242,7 @@ def _quick_score(
     turned = normals @ move[:3, :3].T
     other = everything.normals[np.where(is_near, index, 0)]
     closeness = np.where(is_near, 1.0 - distance / reach_m, 0.0)
-    return float(np.mean(closeness * do_agree(turned, other, False, 0.7)))
+    return float(np.mean(closeness * do_agree(turned, other, np.zeros(len(other), bool), 0.7)))
 
 
 def _peaks(scores: Values) -> list[int]:
