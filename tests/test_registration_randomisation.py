@@ -4,8 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_1samp
 
-from dougong.registration.randomisation import _saddle_point, sign_flip
+from dougong.registration.randomisation import _saddle_point, sign_flip, student
 
 
 def counted(values):
@@ -55,3 +56,14 @@ def test_both_ways_make_one_and_scale_is_no_matter():
     assert sign_flip(values) + sign_flip(-values) == pytest.approx(1.0, abs=1e-6)
     assert sign_flip(1e-6 * values) == pytest.approx(sign_flip(values), rel=1e-6)
     assert sign_flip(np.zeros(4)) == 1.0
+
+
+def test_student_tells_a_few_that_are_alike_and_is_a_plain_t_test():
+    alike = np.array([1.0, 1.05, 0.95, 1.02])
+    assert student(alike) < 1e-3 < sign_flip(alike)
+    values = np.random.default_rng(6).choice([-1.0, 1.0], 40) + 0.4
+    # Equal sizes but for the shift: nearly as many effective as there are.
+    assert student(values) == pytest.approx(
+        ttest_1samp(values, 0.0, alternative="greater").pvalue, rel=0.2
+    )
+    assert student(np.array([5.0, 5.0])) == 1.0

@@ -1,9 +1,9 @@
-"""Fisher's randomisation test: could paired differences as well have had other signs."""
+"""Paired differences: could they as well have had other signs, or a mean of nothing."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy import optimize, special
+from scipy import optimize, special, stats
 
 from dougong.typing import Values
 
@@ -43,6 +43,24 @@ def sign_flip(differences: Values) -> float:
     if total < 0.0:
         return 1.0 - _saddle_point(sizes, -total)
     return _saddle_point(sizes, total)
+
+
+def student(differences: Values) -> float:
+    """Return the chance, by Student's t, of so large a sum if the mean difference were 0.
+
+    Degrees of freedom: the effective number of differences, (sum |d|)^2 / sum d^2, less one, so
+    that unequal ones count for fewer. It tells a few that are alike, which `sign_flip` cannot;
+    1.0 for fewer than three.
+    """
+    size = float(np.abs(differences).sum())
+    if size <= 0.0 or len(differences) < 3:
+        return 1.0
+    count = len(differences)
+    effective = size**2 / float(differences @ differences)
+    off = np.square(differences - differences.mean()).sum()
+    spread = float(np.sqrt(off * count / (count - 1)))
+    statistic = float(differences.sum()) / max(spread, 1e-300)
+    return float(stats.t.sf(statistic, max(effective - 1.0, 1.0)))
 
 
 def _counted(sizes: Values, total: float) -> float:

@@ -28,10 +28,19 @@ _REACH_M = 1.0
 _WORTH = 0.4
 _NEAR_REACH_M = 0.3
 _NEAR_STEP_M = 0.05
+_NEAR_UP_M = 1.0
+_NEAR_ASIDE_M = 0.6
+_NEAR_TURN_DEG = 6.0
 _NEAR_WORTH = 0.5
 
 
-def is_same(a: Transform, b: Transform, at: NDArray[np.float64]) -> bool:
+def is_same(
+    a: Transform,
+    b: Transform,
+    at: NDArray[np.float64],
+    angle_deg: float = SAME_YAW_DEG,
+    shift_m: float = SAME_SHIFT_M,
+) -> bool:
     """Say whether two poses (source -> target) are one: within 5 degrees and 0.5 m.
 
     `at` (3,) is the middle of the source's structure: a turn about a far origin is no shift.
@@ -39,7 +48,12 @@ def is_same(a: Transform, b: Transform, at: NDArray[np.float64]) -> bool:
     turn = a[:3, :3] @ b[:3, :3].T
     angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
     shift = np.linalg.norm(apply(a, at[None]) - apply(b, at[None]))
-    return bool(angle < SAME_YAW_DEG and shift < SAME_SHIFT_M)
+    return bool(angle < angle_deg and shift < shift_m)
+
+
+def is_near(a: Transform, b: Transform, at: NDArray[np.float64]) -> bool:
+    """Say whether two poses lie as close as `propose_neighbours` looks, and rests a little off."""
+    return is_same(a, b, at, _NEAR_TURN_DEG + 0.5, _NEAR_UP_M + 0.25)
 
 
 def middle_of(points: Points) -> NDArray[np.float64]:
@@ -112,13 +126,14 @@ def propose_neighbours(court: Court, winner: Testimony, most: int) -> list[Trans
 
 def _near_families(middle: NDArray[np.float64], axes: NDArray[np.float64]) -> list[list[Transform]]:
     """Return small shifts up, down and both ways along `axes` (2, 2), and turns both ways."""
-    ways = [(np.array([0.0, 0.0, 1.0]), 1.0), *((np.array([*axis, 0.0]), 0.6) for axis in axes)]
+    ways = [(np.array([0.0, 0.0, 1.0]), _NEAR_UP_M)]
+    ways += [(np.array([*axis, 0.0]), _NEAR_ASIDE_M) for axis in axes]
     families = []
     for sign in (1.0, -1.0):
         for way, reach in ways:
             steps = sign * np.arange(_NEAR_STEP_M, reach + 0.5 * _NEAR_STEP_M, _NEAR_STEP_M)
             families.append([_motion(0.0, step * way, middle) for step in steps])
-        turns = sign * np.radians(np.arange(0.5, 6.25, 0.5))
+        turns = sign * np.radians(np.arange(0.5, _NEAR_TURN_DEG + 0.25, 0.5))
         families.append([_motion(turn, np.zeros(3), middle) for turn in turns])
     return families
 

@@ -20,9 +20,10 @@ from dougong.registration.covariance import blocks_of
 from dougong.registration.evidence import Court, Testimony, hear, sharpness, support, violation
 from dougong.registration.icp import Icp, Level, refine_levels
 from dougong.registration.overlap import apply, inverse
-from dougong.registration.randomisation import sign_flip
+from dougong.registration.randomisation import sign_flip, student
 from dougong.registration.result import FineResult, Status
 from dougong.registration.rivals import (
+    is_near,
     is_same,
     middle_of,
     propose_neighbours,
@@ -105,8 +106,9 @@ def compare(court: Court, winner: Testimony, rival: Testimony, block_m: float) -
 
     Blocks lie in the source's frame; target points are put there by the winner's pose, so that
     what both clouds say about one place counts once. If the blocks preferred neither pose, each
-    block's difference could as well have had the other sign (Fisher's randomisation test): no
-    matter how unequal the blocks are, one heavy wall stays one observation.
+    block's difference could as well have had the other sign (Fisher's randomisation test), or
+    their mean were 0 (Student's t). The first tells many unequal blocks, the second a few alike;
+    the smaller chance counts, doubled because two were looked at.
     """
     back = apply(inverse(winner.T), court.target.points)
     places = np.concatenate([court.source.points, back])
@@ -117,21 +119,23 @@ def compare(court: Court, winner: Testimony, rival: Testimony, block_m: float) -
     sums: Values = np.bincount(block, difference, count).astype(np.float64)
     mass = np.bincount(block, weights, count)
     gain = float(sums.sum() / max(float(mass.sum()), 1e-300))
-    telling = _telling(sums[mass > 0.0])
-    return Comparison(T=rival.T, gain=gain, p_value=sign_flip(telling), blocks=len(telling))
+    sums = sums[mass > 0.0]
+    chance = min(sign_flip(_telling(sums, 0.9)), student(_telling(sums, 0.99)))
+    p_value = min(1.0, 2.0 * chance)
+    return Comparison(T=rival.T, gain=gain, p_value=p_value, blocks=len(_telling(sums, 0.9)))
 
 
-def _telling(sums: Values) -> Values:
-    """Return the largest block sums, which carry nine tenths of the difference.
+def _telling(sums: Values, share: float) -> Values:
+    """Return the largest block sums, which carry `share` of the difference.
 
     Whichever pose they prefer. The many that hardly differ would all follow one small common
     error, such as a bent cloud's, and outvote the few walls that do tell.
     """
     order = np.argsort(-np.abs(sums), kind="stable")
-    share = np.cumsum(np.abs(sums[order]))
-    if not len(share) or share[-1] <= 0.0:
+    carried = np.cumsum(np.abs(sums[order]))
+    if not len(carried) or carried[-1] <= 0.0:
         return sums[:0]
-    telling: Values = sums[order[: int(np.searchsorted(share, 0.9 * share[-1])) + 1]]
+    telling: Values = sums[order[: int(np.searchsorted(carried, share * carried[-1])) + 1]]
     return telling
 
 
@@ -182,7 +186,7 @@ def rule(
         overruled = overruled if is_beaten(overruled, params) else None
     others = [pose for pose in poses[1:] if not is_same(pose.T, winner.T, at)]
     results = [compare(court, winner, other, params.block_m) for other in (*others, *twins)]
-    is_told = [is_beaten(c, params, is_same(c.T, winner.T, at)) for c in results]
+    is_told = [is_beaten(c, params, is_near(c.T, winner.T, at)) for c in results]
     beaten = [c for c, told in zip(results, is_told, strict=True) if told]
     undecided = [c for c, told in zip(results, is_told, strict=True) if not told]
     explained, sharp = support(court, winner), sharpness(court, winner)
@@ -213,15 +217,14 @@ def _told_apart(court: Court, poses: Sequence[Testimony]) -> tuple[Testimony, li
     return best, apart
 
 
-def is_beaten(comparison: Comparison, params: Verdict, is_near: bool = False) -> bool:
+def is_beaten(comparison: Comparison, params: Verdict, is_close: bool = False) -> bool:
     """Say whether the data tell a rival from the winner.
 
     A difference three times as large as asked may be ten times less rare: small sites have few
-    blocks, and a handful of walls cannot be rarer than that. So close by that both poses count as
-    one place (`is_near`), what is bent or unseen is alike for both: a small gain is a true one,
+    blocks, and a handful of walls cannot be rarer than that. Within about a metre (`is_close`) what is bent or unseen is alike for both: a small gain is a true one,
     and a large one needs no count of blocks.
     """
-    if is_near:
+    if is_close:
         is_rare = comparison.gain >= params.twin_gain and comparison.p_value <= params.p_value
         return is_rare or comparison.gain >= params.gain
     limit = params.p_value * (10.0 if comparison.gain >= 3.0 * params.gain else 1.0)
