@@ -221,8 +221,9 @@ def is_beaten(comparison: Comparison, params: Verdict, is_close: bool = False) -
     """Say whether the data tell a rival from the winner.
 
     A difference three times as large as asked may be ten times less rare: small sites have few
-    blocks, and a handful of walls cannot be rarer than that. Within about a metre (`is_close`) what is bent or unseen is alike for both: a small gain is a true one,
-    and a large one needs no count of blocks.
+    blocks, and a handful of walls cannot be rarer than that. Within about a metre (`is_close`)
+    what is bent or unseen is alike for both: a small gain is a true one, and a large one needs no
+    count of blocks.
     """
     if is_close:
         is_rare = comparison.gain >= params.twin_gain and comparison.p_value <= params.p_value
