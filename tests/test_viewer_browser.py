@@ -211,6 +211,12 @@ def test_every_colouring_has_its_legend(page):
         assert all(word in legend for word in words), (name, legend)
 
 
+def test_the_legend_of_sources_is_one_line(page):
+    """The report's own styles do not reach into the viewer."""
+    legend = page.tab.locator("#viewer .viewer-legend").bounding_box()
+    assert legend["height"] < 45
+
+
 def test_removed_points_are_shown_where_the_reason_is_asked_for_and_only_there(page):
     sky = [3.0, -7.0, 8.0]
 

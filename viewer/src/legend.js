@@ -2,7 +2,7 @@
 import { CLASSES, HEIGHT, NONE, REASONS, RESIDUAL, SIGNED, hex } from "./colours.js";
 import { h } from "./dom.js";
 
-const key = (colour, words) => h("span", { class: "key" },
+const key = (colour, words) => h("span", { class: "legend-key" },
   h("i", { class: "swatch", style: `background:${colour}` }), words);
 
 function ramp(stops, low, high, title) {
