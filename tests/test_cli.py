@@ -126,7 +126,7 @@ def test_memory_is_read_with_its_unit(text, size):
     assert Common(memory=text).memory_bytes() == size
 
 
-@pytest.mark.parametrize("text", ["", "GB", "-1GB", "0GB", "4 apples"])
+@pytest.mark.parametrize("text", ["", "GB", "-1GB", "0GB", "4 apples", "4"])
 def test_memory_that_is_no_size_is_refused(text):
     with pytest.raises(InputError, match="--memory needs a size"):
         Common(memory=text).memory_bytes()

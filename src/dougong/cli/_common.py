@@ -12,6 +12,10 @@ from dougong.errors import InputError
 GLOBAL = Group("Global options", sort_key=100)
 
 
+_LEAST_BYTES = 100_000
+"""Less memory than this is a forgotten unit."""
+
+
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Common:
@@ -49,7 +53,14 @@ class Common:
             msg = f"--memory needs a size such as 4GB or 800MB, got {self.memory!r}."
             raise InputError(msg)
         power = "BKMGT".index((found[2] or "B").upper())
-        return int(float(found[1]) * (1024 if found[3] else 1000) ** power)
+        size = int(float(found[1]) * (1024 if found[3] else 1000) ** power)
+        if size < _LEAST_BYTES:
+            msg = (
+                f"--memory needs a size such as 4GB or 800MB, got {self.memory!r}, which is "
+                f"{size:,} bytes."
+            )
+            raise InputError(msg)
+        return size
 
     def check(self) -> None:
         """Refuse what this version cannot do.
