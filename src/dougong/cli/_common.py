@@ -10,8 +10,6 @@ from cyclopts import Group, Parameter
 from dougong.errors import InputError
 
 GLOBAL = Group("Global options", sort_key=100)
-
-
 _LEAST_BYTES = 100_000
 """Less memory than this is a forgotten unit."""
 
@@ -28,7 +26,8 @@ class Common:
     threads: Annotated[int | None, Parameter(group=GLOBAL)] = None
     """Threads to use; default: all this process may use."""
     memory: Annotated[str | None, Parameter(group=GLOBAL)] = None
-    """Memory to stay under, for example 4GB; a job that needs more is refused at once."""
+    """Memory to stay under, for example 4GB: larger scans are decimated on tiles, what still does not
+    fit is refused."""
     engine: Annotated[str, Parameter(group=GLOBAL)] = "local"
     """Who runs the work. This version knows: local."""
     work: Annotated[Path | None, Parameter(group=GLOBAL)] = None
