@@ -26,8 +26,8 @@ class Common:
     threads: Annotated[int | None, Parameter(group=GLOBAL)] = None
     """Threads to use; default: all this process may use."""
     memory: Annotated[str | None, Parameter(group=GLOBAL)] = None
-    """Memory to stay under, for example 4GB: larger scans are decimated on tiles, what still does not
-    fit is refused."""
+    """Memory to stay under, for example 4GB: larger scans are decimated on tiles, what still does
+    not fit is refused."""
     engine: Annotated[str, Parameter(group=GLOBAL)] = "local"
     """Who runs the work. This version knows: local."""
     work: Annotated[Path | None, Parameter(group=GLOBAL)] = None

@@ -249,11 +249,11 @@ def _sentence(
             f"(level of detection {1e3 * worst['lod95_m']:.0f} mm){more}."
         )
     where = (
-        f"On the one large shared face {measured.source} does not stand off {measured.target} as a "
-        "whole"
-        if len(faces) == 1
-        else f"On none of {len(faces)} large faces does {measured.source} stand off {measured.target} "
+        f"On the one large shared face {measured.source} does not stand off {measured.target} "
         "as a whole"
+        if len(faces) == 1
+        else f"On none of {len(faces)} large faces does {measured.source} stand off "
+        f"{measured.target} as a whole"
         if faces
         else f"No large even face is shared; over all that is, {measured.source} and "
         f"{measured.target} differ by {1e3 * everywhere['median_m']:+.0f} mm (median)"
