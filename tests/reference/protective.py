@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from scipy.stats import binom
 
 from reference.filters import distances
 
@@ -27,7 +28,7 @@ def spacing(points, own, edge):
     return count, mean
 
 
-def frames(points, order, table, alpha, gamma, reach, neighbours):
+def frames(points, order, table, alpha, gamma, reach, neighbours, usual, stretch):
     """Return neighbours, axes (n, 3, 3) by rising variance and divisors (n, 3)."""
     near, axes, divisors = [], [], []
     for i in range(len(points)):
@@ -42,9 +43,11 @@ def frames(points, order, table, alpha, gamma, reach, neighbours):
         least, middle = np.maximum(values[:2], 0) / values.sum()
         flat, line = 1 - math.tanh(gamma * least), 1 - math.tanh(gamma * (least + middle))
         axes.append(vectors)
-        divisors.append(
-            (1 + alpha * flat * (1 - line), 1 + alpha * max(flat, line), 1 + alpha * line)
-        )
+        excuse = 1 + alpha * line
+        if len(group) >= 8:
+            pitch = math.sqrt(12 * max(values[2], 0) / (len(group) ** 2 - 1))
+            excuse = max(excuse, line * stretch * pitch / usual[i])
+        divisors.append((1 + alpha * flat * (1 - line), max(1 + alpha * flat, excuse), excuse))
     return near, np.array(axes), np.array(divisors)
 
 
@@ -61,6 +64,39 @@ def groups(links, n):
     return group
 
 
+def in_row(points, spacing, rule, radius):
+    """Return the logarithm (n,) of how many such rows chance makes, at most 0."""
+    n, table = len(points), distances(points)
+    order = np.argsort(table, axis=1, kind="stable")
+    best = np.zeros(n)
+    for i in range(n):
+        near = [j for j in order[i, : rule.ROW_NEIGHBOURS] if table[i, j] <= radius]
+        if len(near) < 3:
+            continue
+        half = rule.ROW_WIDTH * spacing[i]
+        p = (
+            4
+            * half
+            / (math.pi * (table[i, near[-1]] if len(near) == rule.ROW_NEIGHBOURS else radius))
+        )
+        if p >= 0.5:
+            continue
+        off = points[near] - points[i]
+        for j in range(len(near)):
+            length = np.linalg.norm(off[j])
+            if length < spacing[i]:
+                continue
+            t = off @ off[j] / length
+            aside = np.maximum((off**2).sum(axis=1) - t**2, 0.0)
+            count, last = 0, -math.inf
+            for place in np.sort(t[aside <= half**2]):
+                if place - last >= half and abs(place) >= half:
+                    count, last = count + 1, place
+            tail = binom.sf(count - 2, len(near) - 1, p)
+            best[i] = min(best[i], math.log(len(near)) + math.log(max(tail, 1e-300)))
+    return best
+
+
 def judge(points, alpha, gamma, limits, rule, reach=0.5):
     """Return margin (n,) and spacing (n,); `rule` is the module that holds the constants."""
     n, table = len(points), distances(points)
@@ -71,7 +107,7 @@ def judge(points, alpha, gamma, limits, rule, reach=0.5):
     held, near_log = spacing(points, own, rule.NEAR_CELLS * reach)
     _, far_log = spacing(points, own, rule.FAR_CELLS * reach)
     usual = np.exp2((held * near_log + rule.FEW * far_log) / (held + rule.FEW))
-    args = (alpha, gamma, reach, rule.NEIGHBOURS)
+    args = (alpha, gamma, reach, rule.NEIGHBOURS, usual, math.pi / 2 * limits[-1])
     near, axes, divisors = frames(points, order, table, *args)
     margin, links = np.full(n, np.inf), []
     for i in range(n):
@@ -95,4 +131,12 @@ def judge(points, alpha, gamma, limits, rule, reach=0.5):
         gap = min(rule.GROUP * reach, table[np.ix_(mine, large)].min() if large.any() else np.inf)
         size = max(usual[mine].mean() * math.sqrt(mine.sum()), extent[g])
         margin[mine] = np.maximum(margin[mine], gap / size)
+    gone = np.flatnonzero(margin > 1)
+    if len(gone):
+        log = in_row(
+            points[gone], np.minimum(usual[gone], rule.ROW_REACH * reach), rule, rule.GROUP * reach
+        )
+        sure = gone[log < 0]
+        excused = math.log(rule.ROW_ACCIDENTS) / log[log < 0]
+        margin[sure] = np.minimum(margin[sure], excused)
     return margin, usual

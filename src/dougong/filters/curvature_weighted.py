@@ -42,7 +42,7 @@ class CurvatureWeighted(Parameters):
     """``protective``: share of the points of a randomly sampled surface that each of its distance
     tests would take if nothing excused them. More removes more."""
     reach_m: Annotated[float, Field(gt=0)] | None = None
-    """``protective``: nothing farther is a neighbour; the halo is 11 times this. None: 0.5 m,
+    """``protective``: nothing farther is a neighbour; the halo is 13 times this. None: 0.5 m,
     doubled or halved until it is 5 to 100 median spacings of the cloud."""
     radius_init_m: Annotated[float, Field(gt=0)] = 0.3
     """Radius of the ball that curvature and local statistics are taken from."""

@@ -3,7 +3,8 @@
 docs/denoising.md has the reasoning and what it was measured on. In short: the spacing that
 scans have hereabouts is the yardstick; a neighbour's distance is divided along the surface or the
 line it lies on, never inflated; the first to eighth nearest are tested together, so that pairs do
-not vouch for each other; groups that are smaller than their distance from everything large go.
+not vouch for each other; groups that are smaller than their distance from everything large go;
+rows that chance does not make stay.
 Kernels are imported when called.
 """
 
@@ -41,6 +42,11 @@ GROUP = 2.0
 """A group that extends farther than this many reaches is large; a wider gap is taken as this."""
 MANY = 1000
 """A group of so many points is large: whatever it is, it was scanned, not stirred up."""
+ROW_NEIGHBOURS, ROW_WIDTH, ROW_ACCIDENTS = 24, 0.5, 1e-3
+"""A point stays if, among this many nearest of those that would go, a row (this many spacings to
+either side) has so many that chance would make fewer than this number of such rows there."""
+ROW_REACH = 0.1
+"""In rows the spacing counts as at most this many reaches."""
 _STEPS = 1 << 16
 """Steps per unit in which logarithms are summed, exactly."""
 _SMALLEST_M = 2.0**-14
@@ -77,11 +83,13 @@ class Verdict(NamedTuple):
 def halo_m(reach_m: float | None) -> float:
     """Return how far the rule reaches: a group, its gap, another group, and their surroundings.
 
+    Points in a row with one that would go are judged themselves, so its length comes on top.
+
     Infinity where the reach is taken from the cloud: find it first, with `reach_for`.
     """
     if reach_m is None:
         return math.inf
-    return reach_m * (3.0 * GROUP + 3.0 + 2.0 * FAR_CELLS)
+    return reach_m * (4.0 * GROUP + 3.0 + 2.0 * FAR_CELLS)
 
 
 def reach_for(points: ArrayLike) -> float:
@@ -125,6 +133,16 @@ def distance_limits(surface_loss: float) -> Values:
     return limits
 
 
+def line_stretch(limits: Values) -> float:
+    """Return what distances along a line are divided by, in pitches of the line per spacing.
+
+    On a line hit at random the k-th nearest lies within x with 2 x / pitch distributed as
+    Gamma(k), where on a surface it is pi r^2 / spacing^2: this turns the limit of the last test on
+    a surface into that on a line.
+    """
+    return float(0.5 * np.pi * limits[-1])
+
+
 def judge(
     points: ArrayLike,
     alpha: float,
@@ -144,9 +162,12 @@ def judge(
     curvature, frame = np.zeros(n), np.zeros((n, 9), np.float32)
     margin, decisive = np.empty(n), np.zeros(n, np.uint8)
     limits = distance_limits(surface_loss)
+    stretch = line_stretch(limits)
 
     def see(start: int, stop: int) -> None:
-        kernels.frames(index.points, places, alpha, gamma, start, stop, curvature, frame)
+        kernels.frames(
+            index.points, places, alpha, gamma, spacing, stretch, start, stop, curvature, frame
+        )
 
     def test(start: int, stop: int) -> None:
         kernels.support(index.points, places, frame, spacing, limits, start, stop, margin, decisive)
@@ -158,10 +179,40 @@ def judge(
     lonely = _group_margin(index, places, frame, spacing, GROUP * reach)
     is_worse = lonely > margin
     margin[is_worse], reason[is_worse] = lonely[is_worse], Taken.SMALL_GROUP
+    _excuse_rows(index, spacing, reach, margin)
     reason[margin <= 1.0] = Taken.KEPT
     back = np.empty(n, np.int64)
     back[index.order] = np.arange(n)
     return Verdict(margin[back], reason[back], spacing[back], curvature[back])
+
+
+def _excuse_rows(index: Neighbourhood, spacing: Values, reach: float, margin: Values) -> None:
+    """Lower the margin (n,) of points that would go but lie in a row with others that would.
+
+    A wire that a scan met in a few places is nothing to its neighbours, and chance makes no rows.
+    """
+    from dougong.filters.neighbourhood import build_index, knn
+    from dougong.kernels import protective as kernels
+
+    chosen = np.flatnonzero(margin > 1.0)
+    if not len(chosen):
+        return
+    points = index.points[chosen]
+    places = knn(build_index(points), None, ROW_NEIGHBOURS, GROUP * reach)[0].astype(np.int32)
+    # Where next to nothing is in reach, the spacing says so little that a row would be a road.
+    usual = np.minimum(spacing[chosen], ROW_REACH * reach)
+    accident = np.zeros(len(chosen))
+    for_blocks(
+        len(chosen),
+        _BLOCK,
+        lambda start, stop: kernels.rows(
+            points, places, usual, ROW_WIDTH, GROUP * reach, start, stop, accident
+        ),
+    )
+    is_sure = accident < 0.0
+    excused = np.full(len(chosen), np.inf)
+    excused[is_sure] = math.log(ROW_ACCIDENTS) / accident[is_sure]
+    margin[chosen] = np.minimum(margin[chosen], excused)
 
 
 def _neighbours(index: Neighbourhood, reach: float) -> tuple[NDArray[np.int32], Values]:

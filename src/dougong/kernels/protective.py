@@ -18,6 +18,9 @@ Small = NDArray[np.int32]
 Singles = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
+LINE = 8
+"""So many points in a row are no accident: their own pitch counts along them."""
+
 
 @kernel
 def _covariance(points: Floats, places: Small, i: int, a: Floats) -> int:
@@ -48,6 +51,8 @@ def frames(
     places: Small,
     alpha: float,
     gamma: float,
+    spacing: Floats,
+    stretch: float,
     start: int,
     stop: int,
     variation: Floats,
@@ -56,8 +61,9 @@ def frames(
     """Fill variation (n,) and out (n, 9) for sorted points start .. stop - 1 from their places.
 
     out: unit normal, unit long axis, then the divisors (at least 1) of distances along the middle
-    axis, along the long axis, and along the long axis where links are made (lines only).
-    places (n, k) int32, -1 where missing.
+    axis, along the long axis, and along the long axis where links are made (lines only). A line
+    of at least `LINE` points excuses `stretch` times its own pitch. places (n, k) int32, -1 where
+    missing; spacing (n,).
     """
     a = np.empty((3, 3), np.float64)
     v = np.empty((3, 3), np.float64)
@@ -79,9 +85,14 @@ def frames(
         for axis in range(3):
             out[i, axis] = v[axis, small]
             out[i, 3 + axis] = v[axis, large]
+        excuse = 1.0 + alpha * line
+        if held >= LINE:
+            # Evenly spaced points have this pitch for their variance.
+            pitch = math.sqrt(12.0 * max(a[large, large], 0.0) / (held * held - 1.0))
+            excuse = max(excuse, line * stretch * pitch / spacing[i])
         out[i, 6] = 1.0 + alpha * flat * (1.0 - line)
-        out[i, 7] = 1.0 + alpha * max(flat, line)
-        out[i, 8] = 1.0 + alpha * line
+        out[i, 7] = max(1.0 + alpha * flat, excuse)
+        out[i, 8] = excuse
 
 
 @kernel
@@ -239,6 +250,90 @@ def gaps(
                     dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
                     best = min(best, dx * dx + dy * dy + dz * dz)
         out[q] = best
+
+
+@kernel
+def _log_tail(trials: int, hits: int, p: float) -> float:
+    """Return the logarithm of the chance of at least `hits` among `trials` of probability p."""
+    if hits <= 0:
+        return 0.0
+    total = 0.0
+    for k in range(hits, trials + 1):
+        log = math.lgamma(trials + 1.0) - math.lgamma(k + 1.0) - math.lgamma(trials - k + 1.0)
+        total += math.exp(log + k * math.log(p) + (trials - k) * math.log1p(-p))
+    return math.log(max(total, 1e-300))
+
+
+@kernel
+def _in_row(along: Floats, held: int, step: float) -> int:
+    """Return how many of the first `held` places lie at least `step` apart, and from place 0."""
+    ordered = np.sort(along[:held])
+    count = 0
+    last = -np.inf
+    for place in ordered:
+        if place - last >= step and abs(place) >= step:
+            count += 1
+            last = place
+    return count
+
+
+@kernel
+def rows(
+    points: Floats,
+    places: Small,
+    spacing: Floats,
+    width: float,
+    reach: float,
+    start: int,
+    stop: int,
+    accident: Floats,
+) -> None:
+    """Fill accident (n,): how many rows like the best through each point chance would make there.
+
+    The logarithm. A row is a strip, `width` spacings to either side of a line through the point
+    and one of its places (n, k) int32; chance throws the others evenly on a disc of their reach.
+    """
+    along = np.empty(places.shape[1], np.float64)
+    for i in range(start, stop):
+        accident[i] = 0.0
+        held = 0
+        far2 = 0.0
+        for column in range(places.shape[1]):
+            j = places[i, column]
+            if j < 0:
+                break
+            held += 1
+            far2 = 0.0
+            for axis in range(3):
+                far2 += (points[j, axis] - points[i, axis]) ** 2
+        if held < 3:
+            continue
+        radius = reach if held < places.shape[1] else math.sqrt(far2)
+        half = width * spacing[i]
+        p = 4.0 * half / (math.pi * radius)
+        if p >= 0.5:
+            continue
+        for column in range(held):
+            j = places[i, column]
+            ux = points[j, 0] - points[i, 0]
+            uy = points[j, 1] - points[i, 1]
+            uz = points[j, 2] - points[i, 2]
+            length = math.sqrt(ux * ux + uy * uy + uz * uz)
+            if length < spacing[i]:
+                continue
+            count = 0
+            for other in range(held):
+                k = places[i, other]
+                x = points[k, 0] - points[i, 0]
+                y = points[k, 1] - points[i, 1]
+                z = points[k, 2] - points[i, 2]
+                t = (x * ux + y * uy + z * uz) / length
+                if x * x + y * y + z * z - t * t <= half * half:
+                    along[count] = t
+                    count += 1
+            aligned = _in_row(along, count, half)
+            log = math.log(held) + _log_tail(held - 1, aligned - 1, p)
+            accident[i] = min(accident[i], log)
 
 
 @kernel
