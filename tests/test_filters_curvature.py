@@ -10,6 +10,7 @@ from dougong import threads
 from dougong.errors import InputError
 from dougong.evaluation.facade import FEATURE, NOISE_LABELS, SURFACE, bracketed_facade
 from dougong.filters import protective
+from dougong.filters.concentration import concentration_note
 from dougong.filters.curvature_weighted import (
     CurvatureWeighted,
     curvature_weighted,
@@ -20,6 +21,7 @@ from reference import filters as twin
 from reference import protective as slow
 
 STEP = 2.0**-18
+PAPER = CurvatureWeighted(rule="paper")
 
 
 def on_lattice(points):
@@ -55,23 +57,26 @@ def test_is_the_twin_in_any_order(seed, n, rule):
 @pytest.mark.parametrize("shift", [[5e5, 4e6, 100.0], [-1e6, 0, 0]])
 def test_map_sized_coordinates_change_nothing(shift):
     points = crease(2000, 5)
-    here, there = curvature_weighted(points), curvature_weighted(points + np.array(shift))
+    here, there = (
+        curvature_weighted(points, PAPER),
+        curvature_weighted(points + np.array(shift), PAPER),
+    )
     np.testing.assert_array_equal(here.is_kept, there.is_kept)
     np.testing.assert_array_equal(here.attributes["curvature"], there.attributes["curvature"])
 
 
 def test_a_far_point_changes_nothing_but_itself():
     points = crease(2000, 6)
-    far = curvature_weighted(np.concatenate([points, [[1e6, 1e6, -1e6]]]))
-    assert far.is_kept.tolist() == [*curvature_weighted(points).is_kept, False]
+    far = curvature_weighted(np.concatenate([points, [[1e6, 1e6, -1e6]]]), PAPER)
+    assert far.is_kept.tolist() == [*curvature_weighted(points, PAPER).is_kept, False]
     with pytest.raises(InputError, match="too far for balls"):
-        curvature_weighted([[1e11, 0, 0]])
+        curvature_weighted([[1e11, 0, 0]], PAPER)
 
 
 def test_a_tile_with_its_halo_gives_what_the_whole_gives():
     points, _ = bracketed_facade(200.0, 0.02, 3)
     points = on_lattice(points)
-    params = CurvatureWeighted()
+    params = PAPER
     whole = curvature_weighted(points, params)
     core = (points[:, 0] >= 4.0) & (points[:, 0] < 7.0)
     read = (points[:, 0] >= 4.0 - halo_m(params)) & (points[:, 0] < 7.0 + halo_m(params))
@@ -87,7 +92,7 @@ def test_threads_change_nothing():
         chosen = []
         for count in (1, 3):
             threads.set_threads(count)
-            chosen.append(curvature_weighted(points))
+            chosen.append(curvature_weighted(points, PAPER))
     finally:
         threads.set_threads(before)
     np.testing.assert_array_equal(chosen[0].is_kept, chosen[1].is_kept)
@@ -97,19 +102,22 @@ def test_threads_change_nothing():
 def test_many_neighbours_are_summed_exactly():
     rng = np.random.default_rng(8)
     points = on_lattice(rng.random((4000, 3)) * [0.6, 0.6, 0.02])
-    kappa = curvature_weighted(points).attributes["curvature"]
+    kappa = curvature_weighted(points, PAPER).attributes["curvature"]
     np.testing.assert_allclose(kappa[::40], twin.curvature(points, 0.3, every=40), atol=1e-10)
 
 
 def test_small_and_degenerate_clouds():
     assert curvature_weighted(np.empty((0, 3))).is_kept.tolist() == []
-    assert curvature_weighted([[1.0, 2, 3]]).is_kept.tolist() == [False]
-    assert curvature_weighted([[1.0, 2, 3], [1.0, 2, 3.05]]).is_kept.tolist() == [True, True]
-    assert curvature_weighted([[1.0, 2, 3], [1.0, 2, 4.0]]).is_kept.tolist() == [False, False]
-    same = curvature_weighted(np.full((70, 3), 3.3))
+    assert curvature_weighted([[1.0, 2, 3]], PAPER).is_kept.tolist() == [False]
+    assert curvature_weighted([[1.0, 2, 3], [1.0, 2, 3.05]], PAPER).is_kept.tolist() == [True, True]
+    assert curvature_weighted([[1.0, 2, 3], [1.0, 2, 4.0]], PAPER).is_kept.tolist() == [
+        False,
+        False,
+    ]
+    same = curvature_weighted(np.full((70, 3), 3.3), PAPER)
     assert same.is_kept.all()
     assert (same.attributes["curvature"] == 0).all()
-    line = curvature_weighted(np.arange(100)[:, None] * [2.0**-5, 0.0, 0.0])
+    line = curvature_weighted(np.arange(100)[:, None] * [2.0**-5, 0.0, 0.0], PAPER)
     assert line.is_kept.all()
     assert (line.attributes["curvature"] == 0).all()
 
@@ -128,7 +136,7 @@ def test_on_the_facade_it_keeps_brackets_where_sor_does_not():
     global 90.8 / 79.0 / 98.7, SOR at 1 sigma 92.5 / 64.7.
     """
     points, labels = bracketed_facade(300.0, 0.02, 0)
-    paper = rates(curvature_weighted(points).is_kept, labels)
+    paper = rates(curvature_weighted(points, PAPER).is_kept, labels)
     everywhere = rates(curvature_weighted(points, CurvatureWeighted(rule="global")).is_kept, labels)
     sor = {
         m: rates(statistical(points, Statistical(radius_m=0.15, multiplier=m)).is_kept, labels)
@@ -146,7 +154,7 @@ def test_on_the_facade_it_keeps_brackets_where_sor_does_not():
 
 def test_solid_voxels_are_spared_when_asked():
     points = np.array([[0.0, 0, 0], [0, 0, 5.0]])
-    params = CurvatureWeighted(solid_voxel_count=5)
+    params = CurvatureWeighted(rule="paper", solid_voxel_count=5)
     chosen = curvature_weighted(points, params, voxel_count=[1, 9])
     assert chosen.is_kept.tolist() == [False, True]
     with pytest.raises(InputError, match="no voxel_count came"):
@@ -267,7 +275,7 @@ def test_protective_keeps_brackets_and_walls_of_the_facade():
 
 
 def test_protective_spares_solid_voxels_and_says_so():
-    params = CurvatureWeighted(rule="protective", solid_voxel_count=5)
+    params = CurvatureWeighted(rule="protective", reach_m=0.5, solid_voxel_count=5)
     chosen = curvature_weighted([[0.0, 0, 0], [0, 0, 5.0]], params, voxel_count=[1, 9])
     assert chosen.is_kept.tolist() == [False, True]
     assert chosen.attributes["removal_reason"].tolist() == [protective.Taken.ALONE, 0]
@@ -287,3 +295,54 @@ def test_protective_keeps_a_wire_that_was_hit_in_a_few_places():
     is_kept = curvature_weighted(given, PROTECTIVE).is_kept
     assert is_kept[6400:-25].mean() > 0.9
     assert (~is_kept[-25:]).mean() > 0.9
+
+
+def test_a_small_thing_alone_is_what_was_scanned():
+    """No group is large in such clouds: the one of most points stays, what flies about goes."""
+    plate = wall(400, 8, 0.4)
+    strays = np.array([[1.5, 0.4, 0.1], [0.2, -1.2, 0.3]])
+    is_kept = curvature_weighted(np.concatenate([plate, strays])).is_kept
+    assert is_kept[:400].mean() > 0.97
+    assert not is_kept[400:].any()
+    assert curvature_weighted([[1.0, 2, 3], [1.0, 2, 9]]).is_kept.all()
+    assert curvature_weighted(np.full((70, 3), 3.3)).is_kept.all()
+
+
+def test_margins_and_verdicts_agree():
+    points = crease(3000, 4)
+    for params in (PAPER, CurvatureWeighted(rule="global"), CurvatureWeighted()):
+        chosen = curvature_weighted(points, params)
+        np.testing.assert_array_equal(chosen.attributes["removal_margin"] > 1, ~chosen.is_kept)
+        assert not chosen.is_kept.all()
+
+
+def studded(seed):
+    """A wall with half-balls on half of it, and which points are on the balls."""
+    rng = np.random.default_rng(seed)
+    flat = wall(4000, seed)
+    at = np.stack(np.meshgrid(np.arange(0.2, 2, 0.2), np.arange(0.2, 4, 0.2)), -1).reshape(-1, 2)
+    ball = rng.normal(size=(len(at), 60, 3))
+    ball *= 0.06 / np.linalg.norm(ball, axis=2, keepdims=True)
+    ball[..., 1] = -np.abs(ball[..., 1])
+    studs = (ball + np.stack([at[:, 0], 0 * at[:, 0], at[:, 1]], -1)[:, None]).reshape(-1, 3)
+    points = np.concatenate([flat, studs])
+    return points, np.arange(len(points)) >= len(flat)
+
+
+def test_removal_that_prefers_carving_is_said():
+    points, is_stud = studded(3)
+    variation = np.where(is_stud, 0.2, 0.01)
+    rng = np.random.default_rng(4)
+    evenly = rng.random(len(points)) > 0.05
+    assert concentration_note(points, evenly, variation, 0.05) is None
+    unfair = rng.random(len(points)) > np.where(is_stud, 0.2, 0.01)
+    said = concentration_note(points, unfair, variation, 0.05)
+    assert "on fine geometry" in said
+    assert "--mark" in said
+    assert concentration_note(points[:0], unfair[:0], variation[:0], 0.05) is None
+
+
+def test_the_default_does_not_prefer_the_carving_of_the_facade():
+    points, labels = bracketed_facade(300.0, 0.02, 0)
+    assert curvature_weighted(points).notes == ()
+    assert rates(curvature_weighted(points).is_kept, labels)[1] > 97.5

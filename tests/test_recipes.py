@@ -112,10 +112,16 @@ def test_point_order_and_map_offset_change_nothing(cloud, lidar):
 
 
 def test_marks_keep_every_point_and_undo(cloud, lidar):
-    all_points = marked(cloud, lidar.codes, lidar.ground_class)
+    all_points = marked(cloud, lidar.codes, lidar.ground_class, lidar.details)
     assert len(all_points) == len(cloud)
     np.testing.assert_array_equal(all_points.attribute("classification_in"), 1)
     np.testing.assert_array_equal(all_points.attribute("dougong_reason"), lidar.codes)
+    detail, margin = (all_points.attribute(name) for name in ("dougong_detail", "dougong_margin"))
+    by_curvature = lidar.codes == Reason.CURVATURE_WEIGHTED
+    np.testing.assert_array_equal(detail > 0, by_curvature)
+    np.testing.assert_array_equal(margin > 1, by_curvature)
+    assert (margin[lidar.codes == Reason.DECIMATED] == 0).all()
+    assert np.isfinite(margin).all()
     new = all_points.attribute("classification")
     is_noise = np.isin(lidar.codes, [int(reason) for reason in NOISE])
     assert (new[is_noise] == 7).all()
@@ -257,10 +263,13 @@ def test_a_filter_that_takes_much_for_noise_is_doubted(cloud, lidar):
     """A cloud too sparse for the radii loses half of itself: not silently."""
     assert not any("far more than surveys hold" in note for note in lidar.notes)
     sparse = cloud.select(np.arange(len(cloud)) % 40 == 0)
-    found = filter_single(sparse, "curvature_weighted", single_parameters("curvature_weighted", {}))
+    params = single_parameters("curvature_weighted", {"rule": "paper"})
+    found = filter_single(sparse, "curvature_weighted", params)
     (note,) = [note for note in found.notes if "far more than surveys hold" in note]
     taken = len(sparse) - len(found.cloud)
     assert f"took {taken} of {len(sparse)} points" in note
+    ours = filter_single(sparse, "curvature_weighted", single_parameters("curvature_weighted", {}))
+    assert not any("far more than surveys hold" in note for note in ours.notes)
 
 
 def test_what_is_said_of_marked_points(cloud, tmp_path, capsys):

@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from dougong._checks import as_points
 from dougong.errors import InputError
 from dougong.filters import protective
+from dougong.filters.concentration import concentration_note
 from dougong.filters.selection import Selection
 from dougong.filters.totals import Totals
 from dougong.params import Parameters
@@ -33,11 +34,12 @@ _STATISTIC_STEPS = 1 << 20
 class CurvatureWeighted(Parameters):
     """Remove points whose nearest weighted neighbour is unusually far, for their curvature."""
 
-    rule: Literal["paper", "global", "protective"] = "paper"
-    """What "unusual" is measured against: ``paper``, the statistics of the points in the ball round
-    each point; ``global``, those of the whole cloud; ``protective``, the spacing of the surface
-    near each point, with gaps excused along surfaces and lines (docs/denoising.md). It uses alpha,
-    gamma and surface_loss; radii, beta, curvature_0 and tau are the paper's."""
+    rule: Literal["protective", "paper", "global"] = "protective"
+    """What "unusual" is measured against: ``protective``, the spacing of the surface near each
+    point, with gaps excused along surfaces and lines (docs/denoising.md); ``paper``, the statistics
+    of the points in the ball round each point; ``global``, those of the whole cloud. ``protective``
+    uses alpha, gamma, surface_loss and reach_m; radii, beta, curvature_0 and tau are the others'.
+    """
     surface_loss: Annotated[float, Field(gt=0, lt=0.5)] = 0.025
     """``protective``: share of the points of a randomly sampled surface that each of its distance
     tests would take if nothing excused them. More removes more."""
@@ -226,11 +228,17 @@ def _population(lattice: Lattice, curvature: Values, p: CurvatureWeighted) -> _P
     return _Population(is_alone, steps, *_local_statistics(lattice, steps, p.radius_init_m))
 
 
-def _is_outlier(lattice: Lattice, curvature: Values, p: CurvatureWeighted) -> Mask:
-    """Return the verdict (n,) of eq. 6 in sorted order. An empty neighbourhood is an outlier."""
+def _verdict(lattice: Lattice, curvature: Values, p: CurvatureWeighted) -> tuple[Mask, Values]:
+    """Return the verdict (n,) of eq. 6 and its margin (n,), the statistic as a share of the cut.
+
+    In sorted order. An empty neighbourhood is an outlier, its margin infinite.
+    """
     is_alone, steps, mean, deviation = _population(lattice, curvature, p)
-    is_outlier: Mask = is_alone | (steps > mean + p.tau(curvature) * deviation)
-    return is_outlier
+    cut = mean + p.tau(curvature) * deviation
+    is_outlier: Mask = is_alone | (steps > cut)
+    # Half a step holds up a cut of zero, where all points are duplicates.
+    margin = np.where(is_alone, np.inf, steps / np.maximum(cut, 0.5))
+    return is_outlier, margin
 
 
 def excess(points: ArrayLike, params: CurvatureWeighted | None = None) -> Values:
@@ -265,16 +273,17 @@ def curvature_weighted(
     Returns
     -------
     Selection
-        ``curvature`` (n,): surface variation in the ball of radius_init_m, 0 .. 1/3.
-        ``protective`` adds ``removal_margin`` (n,), above 1 for removed points, ``removal_reason``
-        (n,) uint8 (`protective.Taken`) and ``spacing_m`` (n,); its curvature is that of the 12
-        nearest.
+        ``removal_margin`` (n,), above 1 for removed points, and ``curvature`` (n,): surface
+        variation, 0 .. 1/3, of the 12 nearest (``protective``) or in the ball of radius_init_m.
+        ``protective`` adds ``removal_reason`` (n,) uint8 (`protective.Taken`) and ``spacing_m``
+        (n,), and a note where removal concentrates on fine geometry.
 
     Notes
     -----
-    Coordinates are rounded to 2**-18 m (for 0.3 m), sums are exact integers, so nothing depends on
-    the order of the points. Cost per ball grows with the square root of the points in it.
-    Tile class: local with a halo of 2 radius_init_m + radius_max_m; ``global`` is two-pass.
+    ``paper`` and ``global`` round coordinates to 2**-18 m (for 0.3 m) and sum exact integers, so
+    nothing depends on the order of the points; cost per ball grows with the square root of the
+    points in it. Tile class: local, with the halo of `halo_m` (``protective`` with a reach_m: 13 of
+    it; ``paper``: 2 radius_init_m + radius_max_m); ``global`` is two-pass.
     """
     p = params or CurvatureWeighted()
     if p.rule == "protective":
@@ -285,10 +294,17 @@ def curvature_weighted(
         return Selection(is_kept=np.zeros(0, bool), attributes={"curvature": np.zeros(0)})
     curvature = surface_variation(lattice, p.radius_init_m)
     is_kept = np.empty(n, bool)
-    is_kept[lattice.order] = ~_is_outlier(lattice, curvature, p)
+    is_outlier, margin = _verdict(lattice, curvature, p)
+    is_kept[lattice.order] = ~is_outlier
     if p.solid_voxel_count is not None:
         is_kept |= _is_solid(voxel_count, n, p.solid_voxel_count)
-    return Selection(is_kept=is_kept, attributes={"curvature": lattice.unsorted(curvature)})
+    return Selection(
+        is_kept=is_kept,
+        attributes={
+            "curvature": lattice.unsorted(curvature),
+            "removal_margin": lattice.unsorted(margin),
+        },
+    )
 
 
 def _protective(
@@ -300,6 +316,10 @@ def _protective(
     if p.solid_voxel_count is not None:
         is_kept |= _is_solid(voxel_count, len(is_kept), p.solid_voxel_count)
         reason = np.where(is_kept, protective.Taken.KEPT, reason).astype(np.uint8)
+    note = None
+    if len(is_kept):
+        spacing_m = float(np.median(verdict.spacing_m))
+        note = concentration_note(as_points(points), is_kept, verdict.curvature, spacing_m)
     return Selection(
         is_kept=is_kept,
         attributes={
@@ -308,6 +328,7 @@ def _protective(
             "removal_reason": reason,
             "spacing_m": verdict.spacing_m,
         },
+        notes=() if note is None else (note,),
     )
 
 

@@ -176,10 +176,13 @@ def judge(
     for_blocks(n, _BLOCK, test)
     reason = np.where(decisive == 1, Taken.OFF_SURFACE, Taken.IN_PAIR).astype(np.uint8)
     reason[~np.isfinite(margin)] = Taken.ALONE
-    lonely = _group_margin(index, places, frame, spacing, GROUP * reach)
+    lonely = _group_margin(index, places, frame, spacing, GROUP * reach, is_whole=reach_m is None)
     is_worse = lonely > margin
     margin[is_worse], reason[is_worse] = lonely[is_worse], Taken.SMALL_GROUP
     _excuse_rows(index, spacing, reach, margin)
+    if reach_m is None and n <= TESTS:
+        # So few points have no surroundings to be judged by.
+        margin[:] = 0.0
     reason[margin <= 1.0] = Taken.KEPT
     back = np.empty(n, np.int64)
     back[index.order] = np.arange(n)
@@ -297,8 +300,13 @@ def _group_margin(
     frame: NDArray[np.float32],
     spacing: Values,
     limit_m: float,
+    *,
+    is_whole: bool,
 ) -> Values:
     """Return gap / size (n,) of each point's group; 0 in a large one.
+
+    Where the points are a whole cloud and no group is large, the one of most points is: a small
+    thing alone is what was scanned.
 
     The size is the longest side of the group's box, or the side of the square that its points
     would cover at the spacing here, if that is larger.
@@ -316,7 +324,10 @@ def _group_margin(
     is_root = held > 0
     longest = np.zeros(n)
     longest[is_root] = (extents[is_root, 3:] - extents[is_root, :3]).max(axis=1)
-    chosen = ((longest > limit_m) | (held >= MANY))[parent]
+    is_large = (longest > limit_m) | (held >= MANY)
+    if is_whole and n and not is_large.any():
+        is_large = held == held.max()
+    chosen = is_large[parent]
     asked = np.flatnonzero(~chosen)
     margin = np.zeros(n)
     if not len(asked):

@@ -2,6 +2,7 @@
 
 from typing import Annotated, Literal
 
+import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
@@ -37,7 +38,8 @@ def radius(points: ArrayLike, params: Radius | None = None) -> Selection:
     Returns
     -------
     Selection
-        ``neighbour_count`` (n,) int64: other points within the radius.
+        ``neighbour_count`` (n,) int64: other points within the radius; ``removal_margin`` (n,):
+        those needed per one there is, above 1 for removed points.
 
     Notes
     -----
@@ -49,6 +51,9 @@ def radius(points: ArrayLike, params: Radius | None = None) -> Selection:
     params = params or Radius()
     index = build_index(points)
     counts = count_within(index, None, params.radius_m) - 1
+    with np.errstate(divide="ignore"):
+        margin = params.min_neighbours / counts.astype(np.float64)
     return Selection(
-        is_kept=counts >= params.min_neighbours, attributes={"neighbour_count": counts}
+        is_kept=counts >= params.min_neighbours,
+        attributes={"neighbour_count": counts, "removal_margin": margin},
     )

@@ -152,7 +152,8 @@ def statistical(points: ArrayLike, params: Statistical | None = None) -> Selecti
     Returns
     -------
     Selection
-        ``mean_distance_m`` (n,): inf for a point without a neighbour, which is an outlier.
+        ``mean_distance_m`` (n,): inf for a point without a neighbour, which is an outlier;
+        ``removal_margin`` (n,): the same as a share of the cut, above 1 for removed points.
 
     Notes
     -----
@@ -162,8 +163,11 @@ def statistical(points: ArrayLike, params: Statistical | None = None) -> Selecti
     mean_m = mean_distances(points, params)
     cut, strays = cut_distance(mean_m, params.multiplier)
     # Half a step above: a point exactly at the cut stays, whatever its last digit.
-    is_kept = mean_m <= cut + 0.5 * _STEP_M
+    limit = cut + 0.5 * _STEP_M
+    is_kept = mean_m <= limit
     notes = (f"{strays} points lie far from all others and do not count for the mean",)
     return Selection(
-        is_kept=is_kept, attributes={"mean_distance_m": mean_m}, notes=notes if strays else ()
+        is_kept=is_kept,
+        attributes={"mean_distance_m": mean_m, "removal_margin": mean_m / limit},
+        notes=notes if strays else (),
     )

@@ -44,6 +44,7 @@ from dougong.pipeline.recipes import (
 )
 from dougong.pipeline.registering import register
 from dougong.pipeline.registrations import finite, read_registration, to_document
+from dougong.pipeline.removed import detail_counts
 from dougong.pipeline.settings import parse_overrides, updated, validated
 from dougong.pipeline.single import filter_name, filter_single, single_fields, single_parameters
 from dougong.pipeline.steps import Filtered
@@ -240,19 +241,24 @@ def _filtered_on_tiles(
     )
 
 
-def reason_table(filtered: Filtered) -> dict[str, dict[str, int]]:
-    """Return per reason its code in ``dougong_reason`` and the points it took."""
-    return {
-        reason.name.lower(): {"code": int(reason), "points": int((filtered.codes == reason).sum())}
-        for reason in Reason
-        if (filtered.codes == reason).any()
-    }
+def reason_table(filtered: Filtered) -> dict[str, dict[str, Any]]:
+    """Return per reason its code in ``dougong_reason`` and the points it took, in detail too."""
+    table: dict[str, dict[str, Any]] = {}
+    for reason in Reason:
+        chosen = filtered.codes == reason
+        if not chosen.any():
+            continue
+        row: dict[str, Any] = {"code": int(reason), "points": int(chosen.sum())}
+        if reason == Reason.CURVATURE_WEIGHTED:
+            row["details"] = detail_counts(filtered.codes, filtered.details)
+        table[reason.name.lower()] = row
+    return table
 
 
 def _chosen(job: FilterJob, cloud: Cloud, filtered: Filtered, mark: bool) -> Cloud:
     """Return what is written: the kept points, or all points with their marks."""
     if mark:
-        return marked(cloud, filtered.codes, filtered.ground_class)
+        return marked(cloud, filtered.codes, filtered.ground_class, filtered.details)
     if job.only == "cloth_simulation" and getattr(job.params, "keep", "") == "all":
         # Alone, the cloth takes nothing out: its answer is the class.
         return with_classes(filtered.cloud, [(filtered.is_ground, GROUND_CLASS)])

@@ -19,7 +19,14 @@ from dougong.pipeline.recipes import Recipe, filter_cloud, lidar_after_grid
 from dougong.pipeline.removed import removed_sample
 from dougong.pipeline.steps import Filtered
 from dougong.pipeline.store import Store
-from dougong.pipeline.tiled import GridFirst, filter_chunks, is_too_large, stations_of, undecimated
+from dougong.pipeline.tiled import (
+    GridFirst,
+    filter_chunks,
+    is_too_large,
+    left_of,
+    stations_of,
+    undecimated,
+)
 from dougong.typing import Kind
 
 
@@ -153,14 +160,14 @@ class Loader:
             if books is not None and len(books.codes) == len(cloud):
                 self._say_known(cloud.name)
                 kept = cloud.select(np.flatnonzero(books.codes == Reason.KEPT))
-                removed = removed_sample(cloud, books.codes)
+                removed = removed_sample(cloud, books.codes, details=books.details)
                 yield self._source(entry, file, station, books.on(kept), books.noticed, removed)
                 continue
             with self.clock.measure("filter"):
                 noticed = (*cloud.notes, *faults_of(cloud))
                 filtered = filter_cloud(cloud, entry.kind, self.recipe, self.progress)
             self.store.save(key, filtered, noticed)
-            removed = removed_sample(cloud, filtered.codes)
+            removed = removed_sample(cloud, filtered.codes, details=filtered.details)
             yield self._source(entry, file, station, filtered, noticed, removed)
 
     def _on_tiles(self, entry: Entry, file: Path, digest: str) -> Iterator[Source]:
@@ -179,7 +186,8 @@ class Loader:
                 thinned, codes = undecimated(chunks, books.codes)
                 self._say_known(thinned.name)
                 filtered = books.on(thinned.select(np.flatnonzero(codes == Reason.KEPT)))
-                removed = removed_sample(thinned, codes)
+                details = left_of(books.details, books.codes)
+                removed = removed_sample(thinned, codes, details=details)
                 yield self._source(entry, file, station, filtered, books.noticed, removed)
                 continue
             with self.clock.measure("filter"):

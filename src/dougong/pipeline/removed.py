@@ -1,18 +1,57 @@
 """A sample of what the filters took out, to be looked at: where, and why."""
 
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from dougong.cloud import Cloud
+from dougong.filters.protective import Taken
 from dougong.filters.selection import Reason
 from dougong.formats.faults import coordinate_hashes
+from dougong.pipeline.steps import DETAIL, Filtered
 
 MOST = 100_000
 """Removed points of one file (or station) that are kept for looking."""
 
 
-def removed_sample(cloud: Cloud, codes: NDArray[np.uint8], most: int = MOST) -> Cloud:
-    """Return at most `most` removed points of a raw cloud, with ``dougong_reason``.
+def detail_counts(
+    codes: NDArray[np.uint8], details: Mapping[str, NDArray[Any]]
+) -> dict[str, dict[str, int]]:
+    """Return, per `Taken`, its code in ``dougong_detail`` and the points that it took.
+
+    Empty where the curvature-weighted filter gave no details.
+    """
+    if DETAIL not in details:
+        return {}
+    chosen = details[DETAIL][codes == Reason.CURVATURE_WEIGHTED]
+    counts = np.bincount(chosen, minlength=len(Taken))
+    return {
+        taken.name.lower(): {"code": int(taken), "points": int(counts[taken])}
+        for taken in Taken
+        if taken != Taken.KEPT
+    }
+
+
+def detail_totals(parts: Iterable[Filtered]) -> dict[str, int]:
+    """Return how many points of all parts each detailed reason took."""
+    counts: Counter[str] = Counter()
+    for part in parts:
+        found = detail_counts(part.codes, part.details)
+        counts.update({name: row["points"] for name, row in found.items()})
+    return dict(counts)
+
+
+def removed_sample(
+    cloud: Cloud,
+    codes: NDArray[np.uint8],
+    most: int = MOST,
+    *,
+    details: Mapping[str, NDArray[Any]] | None = None,
+) -> Cloud:
+    """Return at most `most` removed points of a raw cloud, with ``dougong_reason`` and `details`.
 
     Decimated points are left out: each lies in one voxel with a point that was kept. The choice
     is by a hash of the coordinates, so that it depends on no order.
@@ -23,9 +62,14 @@ def removed_sample(cloud: Cloud, codes: NDArray[np.uint8], most: int = MOST) -> 
     codes : ndarray, shape (n,), uint8
         `Reason` of every point.
     most : int
+    details : mapping of str to ndarray, shape (n,), optional
+        What else is known of every point (`Filtered.details`).
     """
     chosen = np.flatnonzero((codes != Reason.KEPT) & (codes != Reason.DECIMATED))
     if len(chosen) > most:
         hashes = coordinate_hashes(cloud.xyz[chosen])
         chosen = np.sort(chosen[np.argsort(hashes, kind="stable")[:most]])
-    return cloud.select(chosen).with_attribute("dougong_reason", codes[chosen])
+    sample = cloud.select(chosen).with_attribute("dougong_reason", codes[chosen])
+    for name, values in (details or {}).items():
+        sample = sample.with_attribute(name, values[chosen])
+    return sample

@@ -36,6 +36,7 @@ from dougong.pipeline.project import Project
 from dougong.pipeline.provenance import Clock, peak_memory_bytes, software
 from dougong.pipeline.registering import register
 from dougong.pipeline.registrations import finite, to_document
+from dougong.pipeline.removed import detail_totals
 from dougong.pipeline.store import Store
 from dougong.registration import Register
 from dougong.registration.control import ControlPoints
@@ -352,6 +353,7 @@ def _cloud_document(link: Linked, loader: Loader) -> dict[str, Any]:
         "reduction": 1.0 - mover.points_out / mover.points_in,
         "stages": stage_documents(mover),
         "reasons": reason_counts([source.filtered.codes for source in mover.sources]),
+        "removal_details": detail_totals(source.filtered for source in mover.sources),
         "removed_shown": sum(len(source.removed) for source in mover.sources),
         "ground_points": int(sum(source.filtered.is_ground.sum() for source in mover.sources)),
     }

@@ -1,8 +1,9 @@
 """Filters applied in turn to one cloud, with a book of what each took and why."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ from dougong.pipeline.progress import Progress
 from dougong.typing import Index, Mask, Values
 
 UNKNOWN, NOT_GROUND, GROUND = 0, 1, 2
+DETAIL, MARGIN = "dougong_detail", "dougong_margin"
+MARGIN_MOST = 1e6
+"""Margins are written as at most this: a point alone has an infinite one."""
 _MUCH_NOISE = 0.2
 """A filter that takes more than this share of what it sees for noise is doubted."""
 
@@ -52,6 +56,9 @@ class Filtered:
     """(n,) of every input point: 0 unknown, 1 not ground, 2 ground (by the cloth)."""
     stages: tuple[StageCount, ...]
     notes: tuple[str, ...] = ()
+    details: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """(n,) arrays over every input point that say more than its code: ``dougong_detail`` uint8 and
+    ``dougong_margin`` float32 where a filter gave them; 0 for points that it did not judge."""
 
     @property
     def is_ground(self) -> Mask:
@@ -72,6 +79,7 @@ class Bench:
     voxel_count: NDArray[np.int32] | None = None
     stages: list[StageCount] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    details: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.codes = np.zeros(len(self.cloud), dtype=np.uint8)
@@ -95,6 +103,7 @@ class Bench:
         asked = left if among is None else among
         selection = verb(asked)
         self.codes[asked[~selection.is_kept]] = reason
+        self._book_details(selection, asked)
         taken = int(np.count_nonzero(~selection.is_kept))
         self.stages.append(
             StageCount(
@@ -107,6 +116,21 @@ class Bench:
         said = [*selection.notes, *_doubts(reason, taken, len(asked))]
         self.notes += [f"{self.cloud.name}, {name}: {note}" for note in said]
         return selection
+
+    def _book_details(self, selection: Selection, asked: Index) -> None:
+        for given, name, dtype in (
+            ("removal_reason", DETAIL, np.uint8),
+            ("removal_margin", MARGIN, np.float32),
+        ):
+            if given not in selection.attributes:
+                continue
+            if name not in self.details:
+                self.details[name] = np.zeros(len(self.cloud), dtype)
+            values = np.minimum(selection.attributes[given], MARGIN_MOST).astype(dtype)
+            if name == MARGIN:
+                # In single precision too a removed point is above 1.
+                values[~selection.is_kept & (values <= 1)] = np.nextafter(np.float32(1), dtype(2))
+            self.details[name][asked] = values
 
     def result(self) -> Filtered:
         """Close the books.
@@ -131,6 +155,7 @@ class Bench:
             ground_class=self.ground_class,
             stages=tuple(self.stages),
             notes=tuple(self.notes),
+            details=self.details,
         )
 
 

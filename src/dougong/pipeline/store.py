@@ -8,10 +8,11 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ from dougong.pipeline.outputs import write_text
 from dougong.pipeline.steps import Filtered, StageCount
 from dougong.typing import Kind
 
+_ALWAYS = ("codes", "ground_class")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Books:
@@ -35,6 +38,7 @@ class Books:
     notes: tuple[str, ...]
     noticed: tuple[str, ...]
     """What reading the input said."""
+    details: Mapping[str, NDArray[Any]]
 
     def on(self, kept: Cloud) -> Filtered:
         """Return the finished step with the points that it kept."""
@@ -44,6 +48,7 @@ class Books:
             ground_class=self.ground_class,
             stages=self.stages,
             notes=self.notes,
+            details=self.details,
         )
 
 
@@ -69,12 +74,14 @@ class Store:
         told = json.loads(books.read_text(encoding="utf-8"))
         with np.load(arrays) as stored:
             codes, ground = stored["codes"], stored["ground_class"]
+            details = {name: stored[name] for name in stored.files if name not in _ALWAYS}
         return Books(
             codes=codes,
             ground_class=ground,
             stages=tuple(StageCount(**stage) for stage in told["stages"]),
             notes=tuple(told["notes"]),
             noticed=tuple(told["noticed"]),
+            details=details,
         )
 
     def save(self, key: str, filtered: Filtered, noticed: Sequence[str]) -> None:
@@ -88,7 +95,12 @@ class Store:
         part = self.folder / f"{key}.part-{os.getpid()}.npz"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            np.savez(part, codes=filtered.codes, ground_class=filtered.ground_class)
+            arrays: dict[str, Any] = {
+                "codes": filtered.codes,
+                "ground_class": filtered.ground_class,
+                **filtered.details,
+            }
+            np.savez(part, **arrays)
             part.replace(self.folder / f"{key}.npz")
         except OSError as error:
             with suppress(OSError):

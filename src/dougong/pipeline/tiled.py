@@ -7,11 +7,12 @@ cloud, point by point.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,7 +143,11 @@ def filter_chunks(
     filtered = _finished(decimated, seconds, job.after, progress)
     return FilteredOnTiles(
         filtered=filtered,
-        removed=removed_sample(decimated.cloud, filtered.codes[decimated.row]),
+        removed=removed_sample(
+            decimated.cloud,
+            filtered.codes[decimated.row],
+            details={name: values[decimated.row] for name, values in filtered.details.items()},
+        ),
         notes=(*decimated.cloud.notes, *decimated.faults),
     )
 
@@ -175,6 +180,14 @@ def undecimated(
         records=np.concatenate([part.records for part in parts]),
     )
     return cloud, codes[codes != Reason.DECIMATED]
+
+
+def left_of(
+    details: Mapping[str, NDArray[Any]], codes: NDArray[np.uint8]
+) -> dict[str, NDArray[Any]]:
+    """Return `details` (n,) of the points that the voxel grid left, by all codes (n,)."""
+    is_left = codes != Reason.DECIMATED
+    return {name: values[is_left] for name, values in details.items()}
 
 
 def _decimated(
@@ -214,4 +227,8 @@ def _finished(
     codes[decimated.row] = left.codes
     ground_class = np.zeros(decimated.points_in, dtype=np.uint8)
     ground_class[decimated.row] = left.ground_class
-    return replace(left, codes=codes, ground_class=ground_class)
+    details = {}
+    for name, values in left.details.items():
+        details[name] = np.zeros(decimated.points_in, dtype=values.dtype)
+        details[name][decimated.row] = values
+    return replace(left, codes=codes, ground_class=ground_class, details=details)
