@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from dougong.evaluation import denoise, denoise_noise
+from dougong.evaluation import denoise, denoise_noise, denoise_real
 from dougong.evaluation.denoise_shapes import SHAPES
 from dougong.evaluation.mesh import FINE, SURFACE, VEGETATION, Tracer
 from dougong.evaluation.solids import block
@@ -122,3 +122,35 @@ def test_the_study_is_plain_rows_and_ours_dominates_on_them():
     table = denoise.summary([r for r in rows if "noise" in r], "filter", ("noise", "vegetation"))
     assert table["CWASF paper"][0][1] >= 0
     assert np.isnan(table["CWASF paper"][1][0])
+
+
+def test_the_study_is_a_command(tmp_path, capsys, monkeypatch):
+    from dougong.cli import call
+    from dougong.evaluation.studies import denoise as study
+
+    monkeypatch.setattr(study, "QUICK_SHAPES", ("facade",))
+    job = ["evaluate", "denoise", "--quick", "--out", str(tmp_path / "s"), "--json", "--quiet"]
+    assert call(job) == 0
+    said = json.loads(capsys.readouterr().out)
+    written = json.loads((tmp_path / "s" / "denoise.json").read_text(encoding="utf-8"))
+    assert said["table"] == written["table"]
+    assert {row["sample"] for row in written["rows"]} == {"facade, scan"}
+    table = (tmp_path / "s" / "denoise.csv").read_text(encoding="utf-8").splitlines()
+    assert len(table) == 1 + len(said["table"])
+    assert (tmp_path / "s" / "denoise.png").read_bytes().startswith(b"\x89PNG")
+    assert call(job) == 2
+    assert "--overwrite" in capsys.readouterr().out
+    job[job.index("--quick")] = "--data=" + str(tmp_path / "none")
+    assert call([*job, "--overwrite"]) == 2
+    assert "is not a folder" in capsys.readouterr().out
+
+
+def test_real_clouds_keep_their_points_and_know_their_noise():
+    rng = np.random.default_rng(2)
+    points = rng.random((4000, 3)) * [300.0, 300.0, 0.4]
+    given = denoise_real.sample_of("plate", points, 3)
+    assert (given.labels < 5).sum() == 4000
+    assert 0.02 < given.is_noise.mean() < 0.05
+    assert not given.is_separable[~given.is_noise].any()
+    again = denoise_real.sample_of("plate", points, 3)
+    np.testing.assert_array_equal(given.points, again.points)

@@ -49,7 +49,7 @@ def test_statistical_is_scipys(scan):
 def test_curvature_is_the_twins(scan):
     points, shuffle, radius_m = scan
     params = CurvatureWeighted(
-        radius_init_m=radius_m, radius_min_m=radius_m / 6, radius_max_m=radius_m
+        rule="paper", radius_init_m=radius_m, radius_min_m=radius_m / 6, radius_max_m=radius_m
     )
     lattice = build_lattice(points, radius_m)
     rounded = np.empty_like(points)

@@ -354,6 +354,28 @@ def _say_if_cold(progress: Progress) -> None:
         )
 
 
+def evaluate(
+    study: str,
+    out: Path | None,
+    *,
+    seed: int,
+    is_quick: bool,
+    runs: int | None,
+    data: Path | None,
+    overwrite: bool,
+    progress: Progress,
+) -> tuple[Document, str]:
+    """Run a study; return its document and its table in words (see `evaluation.studies`)."""
+    from dougong.evaluation.studies import Setting
+    from dougong.evaluation.studies import evaluate as verb
+
+    if runs is not None and runs < 1:
+        raise InputError(f"--runs must be 1 or more, got {runs}.")
+    setting = Setting(seed=seed, runs=runs, is_quick=is_quick, data=data)
+    folder = Path(f"dougong-{study}") if out is None else _named(out)
+    return verb(study, folder, setting, overwrite=overwrite, progress=progress)
+
+
 def report(folder: Path, *, progress: Progress) -> Document:
     """Rebuild ``report.html`` in a result folder."""
     return {"report": str(_build_report(folder, progress))}

@@ -9,6 +9,7 @@ import dougong
 from dougong.cli import (
     check,
     demo,
+    evaluate,
     filter,
     info,
     init,
@@ -49,7 +50,20 @@ def unwrapped(text: str) -> str:
     return "\n".join(lines)
 
 
-for _command in (demo, run, plan, init, info, check, filter, register, transform, report, view):
+for _command in (
+    demo,
+    run,
+    plan,
+    init,
+    info,
+    check,
+    filter,
+    register,
+    transform,
+    report,
+    view,
+    evaluate,
+):
     _command.command.__doc__ = unwrapped(_command.command.__doc__ or "")
     app.command(_command.command, name=_command.__name__.rsplit(".", 1)[1])
 

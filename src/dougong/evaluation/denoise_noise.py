@@ -263,3 +263,19 @@ def make_sample(
         is_separable=separable[shuffle],
         spacing_m=spacing,
     )
+
+
+def noise_round(
+    clean: Points, normals: Points, each: int, spacing: float, rng: Rng
+) -> tuple[Points, Bytes]:
+    """Return isolated, near-surface and clustered noise round points, and its labels.
+
+    `each` points of each kind; mixed pixels and shadows need the surface itself (`make_sample`).
+    """
+    parts = {
+        OUTLIER: _isolated(clean, each, rng),
+        NEAR_NOISE: _near(clean, normals, each, spacing, rng),
+        CLUSTER: _clusters(clean, normals, each, spacing**-2, rng),
+    }
+    labels = [np.full(len(part), kind, np.uint8) for kind, part in parts.items()]
+    return np.concatenate(list(parts.values())), np.concatenate(labels)

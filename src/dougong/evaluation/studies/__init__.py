@@ -1,0 +1,125 @@
+"""Studies: each reproduces one table or figure. One module per study, called as the command does.
+
+A study's module has ``study(setting, progress) -> Findings``. Add a module, its line in `STUDIES`
+and its name in ``cli/evaluate.py``, and ``dougong evaluate NAME`` runs it.
+"""
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from dougong.errors import InputError, OutputError
+from dougong.pipeline.outputs import refuse_existing, watched, write_json, write_text
+from dougong.pipeline.progress import Progress
+from dougong.pipeline.provenance import software
+from dougong.pipeline.registrations import finite
+
+STUDIES: Mapping[str, str] = {
+    "denoise": "noise filters: noise removed against carving kept",
+}
+"""Every study by its name, with what it measures."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setting:
+    """What the user may choose of any study."""
+
+    seed: int = 0
+    """The first run's; the others count on from it."""
+    runs: int | None = None
+    """How often each sample is drawn anew; None: as many as the study says."""
+    is_quick: bool = False
+    """Small samples and few runs: a look, not a measurement."""
+    data: Path | None = None
+    """Folder of real scans."""
+
+    def seeds(self, usual: int, quick: int) -> range:
+        """Return the seeds of the runs."""
+        runs = self.runs or (quick if self.is_quick else usual)
+        return range(self.seed, self.seed + runs)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Findings:
+    """What a study found."""
+
+    rows: Sequence[Mapping[str, Any]]
+    """Every single measurement, plain."""
+    table: Sequence[Mapping[str, Any]]
+    """What is read: means and spreads. Becomes the CSV file; all rows have the same keys."""
+    text: str
+    """The table for a terminal."""
+    draw: Callable[[Path], None]
+    """Writes the figure as PNG."""
+
+
+def evaluate(
+    name: str, out: Path, setting: Setting, *, overwrite: bool, progress: Progress
+) -> tuple[dict[str, Any], str]:
+    """Run a study and write ``NAME.json``, ``NAME.csv`` and ``NAME.png`` into the folder `out`.
+
+    Returns
+    -------
+    document : dict
+        What NAME.json holds, without the single rows, and where the files are.
+    text : str
+        The table for a terminal.
+
+    Raises
+    ------
+    InputError
+        No study has that name, a file exists already, or the data folder is missing.
+    OutputError
+        The folder cannot be written.
+    """
+    if name not in STUDIES:
+        raise InputError(f"there is no study {name!r}; there are {', '.join(STUDIES)}.")
+    if setting.data is not None and not setting.data.is_dir():
+        raise InputError(f"--data {setting.data} is not a folder. Leave it out for none.")
+    files = [out / f"{name}.{suffix}" for suffix in ("json", "csv", "png")]
+    refuse_existing(files, overwrite)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        msg = f"{out} cannot be made: {error.strerror or error}. Choose another --out."
+        raise OutputError(msg) from error
+    found: Findings = import_module(f"dougong.evaluation.studies.{name}").study(setting, progress)
+    document = finite(
+        {
+            "study": name,
+            "about": STUDIES[name],
+            "seed": setting.seed,
+            "runs": setting.runs,
+            "is_quick": setting.is_quick,
+            "data": None if setting.data is None else str(setting.data),
+            "table": [dict(row) for row in found.table],
+            "software": software(),
+        }
+    )
+    with watched(*files):
+        write_json(files[0], {**document, "rows": finite(list(found.rows))})
+        write_text(files[1], _csv(found.table))
+        part = files[2].with_name(f".{name}.part.png")
+        try:
+            found.draw(part)
+            part.replace(files[2])
+        except OSError as error:
+            msg = (
+                f"{files[2]} could not be written: {error.strerror or error}. Choose another --out."
+            )
+            raise OutputError(msg) from error
+        finally:
+            part.unlink(missing_ok=True)
+    return {**document, "files": [str(file) for file in files]}, found.text
+
+
+def _csv(table: Sequence[Mapping[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(table[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
+    return text.getvalue()
