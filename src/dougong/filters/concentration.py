@@ -59,5 +59,5 @@ def concentration_note(
         return None
     return (
         f"took {fine:.1%} of the points on fine geometry and {plain:.1%} elsewhere: it may take "
-        "carving for noise. Look at them with --mark and loosen it."
+        "carving (or leaves) for noise. Look at them with --mark and loosen it."
     )
