@@ -88,7 +88,7 @@ def test_every_command_helps_with_an_example(command, capsys):
         (["info", "a.laz", "--engine", "dask"], "--engine dask is not part of this version"),
         (["info", "a.laz", "--memory", "lots"], "--memory needs a size"),
         (["info", "a.laz", "--threads", "0"], "--threads must be 1 or more"),
-        (["register", "a", "b", "--out", "c", "--dof", "5"], "--dof"),
+        (["register", "a", "b", "--out", "c", "--dof", "8"], "--dof"),
     ],
 )
 def test_usage_errors_are_one_line_and_exit_2(tokens, said, capsys):

@@ -61,7 +61,7 @@ def test_the_reference_is_the_first_photogrammetry_cloud_else_the_first_lidar(pr
         (GOOD + "[registr]\ncoarse='auto'", "'registr', did you mean 'register'"),
         (GOOD + "[register]\ndof=3", r"register\.dof"),
         (GOOD + "[filter.lidar.octree_voxel_grid]\nvoxel=1", "did you mean 'voxel_m'"),
-        (GOOD.replace('"lidar"', '"lidar"\nscale_known = false'), "does not search the scale"),
+        (GOOD.replace('"lidar"', '"lidar"\nscale_known = false'), "must be in known units"),
         (GOOD + "[[", "no valid TOML"),
     ],
 )

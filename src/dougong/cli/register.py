@@ -23,7 +23,7 @@ def command(
     target_kind: _Sensor | None = None,
     coarse: Literal["auto", "plan", "improved-pca", "pca", "sac-ia", "4pcs", "none"] = "auto",
     fine: Literal["point-to-plane", "point-to-point", "none"] = "point-to-plane",
-    dof: Literal["auto", "4", "6"] = "auto",
+    dof: Literal["auto", "4", "5", "6", "7"] = "auto",
     filtered: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     yaw_hint: float | None = None,
     pairs: Path | None = None,
@@ -60,7 +60,8 @@ def command(
     fine
         How the pose is refined.
     dof
-        4: levelled, 6: rigid; auto: 6 with a gravity prior, 4 only where both prove levelled.
+        4: levelled, 6: rigid, 5 and 7: the same with a free scale; auto: 6 with a gravity prior,
+        4 only where both prove levelled.
     filtered
         The inputs are clean already; nothing is dropped as noise.
     yaw_hint

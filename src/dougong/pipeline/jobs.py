@@ -56,6 +56,7 @@ from dougong.pipeline.tiled import (
     stations_of,
 )
 from dougong.registration import Register
+from dougong.registration.free_scale_result import unit_found
 from dougong.typing import Kind
 
 DISTANCES = "distances.laz"
@@ -392,7 +393,8 @@ def register_files(
     measured = None
     if result.status == "ok" or params.accept_best:
         progress.stage(f"measuring {source.name} against {target.name}")
-        measured = measure(clouds[0], clouds[1], result)
+        one, two = unit_found(result.scale_search, clouds)
+        measured = measure(one, two, result)
     if measured is not None:
         write_distances(measured, out / DISTANCES)
     document |= {

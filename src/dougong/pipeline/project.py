@@ -118,10 +118,16 @@ def read_project(path: Path) -> Project:
         raise InputError(msg) from None
     project = validated(Project, values, str(path))
     unscaled = [entry.name for entry in project.cloud if not entry.scale_known]
-    if unscaled:
+    if unscaled or project.registration.dof in (5, 7):
+        asked = (
+            f"cloud {unscaled[0]!r} has scale_known = false"
+            if unscaled
+            else f"register.dof is {project.registration.dof}"
+        )
         msg = (
-            f"{path}: cloud {unscaled[0]!r} has scale_known = false, but this version does not "
-            "search the scale. Scale the cloud to metres first and remove the key."
+            f"{path}: {asked}, but a project's clouds must be in known units: the filters need "
+            "metres. Find the scale with `dougong register SOURCE TARGET --dof 7`, scale the cloud "
+            "by its metres_per_unit, and take the setting out."
         )
         raise InputError(msg)
     return project

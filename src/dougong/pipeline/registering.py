@@ -88,7 +88,8 @@ def register(
         pairs=pairs,
         control=control,
     )
-    if result.status == "failed" and params.coarse in ("auto", "plan"):
+    is_rigid = params.dof not in (5, 7)
+    if result.status == "failed" and is_rigid and params.coarse in ("auto", "plan"):
         turned = upside_down(one, two, result, params, source_kind, target_kind)
         result = result if turned is None else replace(result, reason=turned)
     if pair is not None:

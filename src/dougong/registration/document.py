@@ -40,6 +40,7 @@ def registration_to_json(
         "matrix": None if result.matrix is None else result.matrix.tolist(),
         "scale": result.scale,
         "scale_source": result.scale_source,
+        "scale_search": None if result.scale_search is None else dict(result.scale_search),
         "grid": None if result.grid is None else dict(result.grid),
         "dof": result.dof,
         "coarse": {

@@ -82,6 +82,27 @@ def robust_weights(residuals: Values, scale_m: float, kind: Robust) -> Values:
     return weights
 
 
+def robust_widening(residuals: Values, areas: Values, scale_m: float, kind: Robust) -> float:
+    """Return the factor (>= 1) by which robust weights understate a covariance.
+
+    Weights are not constants: a residual that grows loses weight, so the estimate follows its
+    data more than H with the weights says. The sandwich of an M-estimator has the derivative of
+    the influence in place of the weight (Huber and Ronchetti 2009); `areas` (n,) weigh both.
+    """
+    square = np.square(residuals / scale_m)
+    if kind == "tukey":
+        inner = np.clip(1.0 - square / 4.685**2, 0.0, None)
+        slope = np.where(inner > 0.0, inner * (1.0 - 5.0 * square / 4.685**2), 0.0)
+    elif kind == "geman-mcclure":
+        slope = (1.0 - square / 3.0) / (1.0 + square / 9.0) ** 3
+    else:
+        return 1.0
+    weights = robust_weights(residuals, scale_m, kind)
+    share = float(areas @ slope) / max(float(areas @ weights), 1e-300)
+    # Below a third the residuals are no longer a bell: the factor is bounded.
+    return 1.0 / float(np.clip(share, 1.0 / 3.0, 1.0)) ** 2
+
+
 def normal_equations(
     points: Points, normals: Points, residuals: Values, weights: Values, block: Index, blocks: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -27,6 +27,8 @@ from dougong.registration.control import (
 )
 from dougong.registration.covariance import displacement95
 from dougong.registration.evidence import Court, hear, summon
+from dougong.registration.free_scale import search_scale
+from dougong.registration.free_scale_result import in_metres, refusal, scale_document, with_scale
 from dougong.registration.handedness import LEFT_SENTENCE, handedness
 from dougong.registration.icp import Icp, build_levels, refine
 from dougong.registration.overlap import apply
@@ -54,10 +56,6 @@ Coarse = Literal["auto", "plan", "improved-pca", "pca", "sac-ia", "4pcs", "none"
 _LISTED = 12
 _FACTORS = (0.9, 1.1)
 """Combined factors of survey projections, with room to spare."""
-_LATER = {
-    5: "dof 5 frees the scale, which is not built yet; use auto, 4 or 6",
-    7: "dof 7 frees the scale, which is not built yet; use auto, 4 or 6",
-}
 
 
 class Register(Parameters):
@@ -67,8 +65,9 @@ class Register(Parameters):
     """Where starting poses come from; auto: the plan search. none: the files' own coordinates."""
     fine: Literal["point-to-plane", "point-to-point", "none"] = "point-to-plane"
     """How the best pose is refined."""
-    dof: Literal["auto", 4, 6] = "auto"
-    """Degrees of freedom: 4 levelled, 6 rigid; auto: 6 with a gravity prior."""
+    dof: Literal["auto", 4, 5, 6, 7] = "auto"
+    """Degrees of freedom: 4 levelled, 5 levelled with scale, 6 rigid, 7 rigid with scale; auto: 6
+    with a gravity prior."""
     filtered: bool = False
     """The inputs are clean already: nothing is dropped before the search."""
     yaw_hint_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
@@ -104,12 +103,8 @@ class Register(Parameters):
 
     @field_validator("dof", mode="before")
     @classmethod
-    def _refuse_what_is_not_built(cls, value: object) -> object:
-        if isinstance(value, str) and value.isdigit():
-            value = int(value)
-        if isinstance(value, str | int) and value in _LATER:
-            raise ValueError(_LATER[value])
-        return value
+    def _read_a_number(cls, value: object) -> object:
+        return int(value) if isinstance(value, str) and value.isdigit() else value
 
 
 @dataclass(slots=True)
@@ -168,6 +163,8 @@ def register(
     Deterministic; independent of thread count, point order and coordinate offset.
     """
     params = params or Register()
+    if params.dof in (5, 7):
+        return _with_free_scale(source, target, params, (source_kind, target_kind), pairs, control)
     clock = _Clock()
     fit = None if pairs is None else fit_pairs(pairs, source, target)
     level = None if fit is None else levelled_source(source, fit)
@@ -217,6 +214,39 @@ def register(
     if surveyed is not None:
         result = replace(result, checks=checks_document(surveyed, found.adjusted, found.T))
     return result if fit is None else with_pairs(result, fit)
+
+
+def _with_free_scale(
+    source: Cloud,
+    target: Cloud,
+    params: Register,
+    kinds: tuple[Kind, Kind],
+    pairs: PickedPairs | None,
+    control: ControlPoints | None,
+) -> Registration:
+    """Search the scale, then register the clouds in metres."""
+    clock = _Clock()
+    dof: Literal[4, 6] = 4 if params.dof == 5 else 6
+    found = search_scale(
+        source, target, source_kind=kinds[0], target_kind=kinds[1], icp=params.icp, dof=dof + 1
+    )
+    clock.lap("scale")
+    why = refusal(found)
+    if why is not None:
+        none = _in_file_coordinates(_refused(why), source, target, 1.0, params, clock, [])
+        return replace(none, dof=dof + 1, scale_search=scale_document(found, source, target))
+    one, two = in_metres(found, source, target)
+    result = register(
+        one,
+        two,
+        params.model_copy(update={"dof": dof}),
+        source_kind=kinds[0],
+        target_kind=kinds[1],
+        pairs=pairs,
+        control=control,
+    )
+    result = replace(result, seconds={**clock.seconds, **result.seconds})
+    return with_scale(result, found, (source, target), dof + 1, params.verdict.most_spread_m)
 
 
 def _picked(fit: PairFit, source: Prepared, target: Prepared) -> list[Hypothesis]:
@@ -278,7 +308,7 @@ def decide(
         return _refused(
             "the coarse search found no pose at which the two clouds have anything in common."
         )
-    dof = 6 if params.dof == "auto" else params.dof
+    dof = 4 if params.dof == 4 else 6
     icp = params.icp.model_copy(
         update={"dof": dof, **({} if params.fine == "none" else {"method": params.fine})}
     )

@@ -85,7 +85,7 @@ def plan_search(
     source_levels, target_levels = levels(source_view), levels(target_view)
     hypotheses = [
         Hypothesis(
-            T_target_source=_transform(pose, height, source_view, target_view),
+            T_target_source=pose_transform(pose, height, source_view, target_view),
             score=0.0,
             method="plan",
         )
@@ -253,7 +253,7 @@ def _maxima(
     return peaks
 
 
-def _transform(pose: PlanPose, height: float, source: PlanView, target: PlanView) -> Transform:
+def pose_transform(pose: PlanPose, height: float, source: PlanView, target: PlanView) -> Transform:
     """Return the local 4x4 of a pose between the levelled frames."""
     cosine, sine = np.cos(pose.yaw), np.sin(pose.yaw)
     level = np.eye(4)

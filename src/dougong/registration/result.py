@@ -48,7 +48,8 @@ class FineResult:
     """Share of source points with a target point within `max_distance_m`."""
     overlap_target: float
     covariance: NDArray[np.float64] | None
-    """(6, 6) of (omega rad, v m) about `covariance_about`, block jackknife; None: unknown."""
+    """(6, 6) of (omega rad, v m), with a free scale (7, 7) with ln s, about `covariance_about`,
+    block jackknife; None: unknown."""
     covariance_about: NDArray[np.float64]
     """(3,), local target coordinates."""
     covariance_blocks: int = 0
@@ -77,7 +78,7 @@ class Registration:
     """1 - s2/s1 over poses more than 5 degrees or 0.5 m apart; 1 when there is one pose."""
     fine: FineResult | None
     scale_source: str = "none"
-    """What fixes the scale: none (it is 1), units, grid (crs), grid (given)."""
+    """What fixes the scale: none (it is 1), units, search, grid (crs), grid (given)."""
     grid: Mapping[str, Any] | None = None
     """What map projections do to lengths between the clouds; None: nothing."""
     notes: tuple[str, ...] = ()
@@ -85,5 +86,7 @@ class Registration:
     parameters: Mapping[str, Any] = field(default_factory=dict)
     pairs: Mapping[str, Any] | None = None
     """What the picked pairs said (`picked_pairs.pairs_document`); None: there were none."""
+    scale_search: Mapping[str, Any] | None = None
+    """What the search for the scale found (`free_scale_result.scale_document`); None: none."""
     checks: Mapping[str, Any] | None = None
     """What control and check points said (`control.checks_document`); None: there were none."""

@@ -400,7 +400,12 @@ def _facts(document: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _scale(document: Mapping[str, Any]) -> str:
     """Return the scale of the matrix and what fixes it; documents before 0.2 do not say it."""
     scale = f"{document['scale']:.9g}"
-    grid = document.get("grid")
+    search, grid = document.get("scale_search"), document.get("grid")
+    if search and search["sigma_ln"] is not None:
+        scale += (
+            f", searched: one unit of {search['cloud']} is {search['metres_per_unit']:.6g} m "
+            f"(sigma {100 * search['sigma_ln']:.2g} %)"
+        )
     if grid:
         scale += (
             f", known from the map projection ({grid['ppm']:+.1f} ppm in plan, "

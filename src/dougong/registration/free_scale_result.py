@@ -1,0 +1,130 @@
+"""What a search for the scale says: refused, in doubt, or part of the pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from dougong.cloud import Cloud
+from dougong.registration.free_scale import LEAST, MOST, ScaleSearch, with_unit
+from dougong.registration.result import Registration
+
+
+def refusal(found: ScaleSearch) -> str | None:
+    """Return why there is no scale to go on with; None: there is one."""
+    if not found.candidates:
+        return (
+            f"no scale between {LEAST:g} and {MOST:g} metres per unit brings the two clouds "
+            "together: they have nothing in common that the search can see."
+        )
+    best = found.candidates[0]
+    if not best.fit.holds_scale or best.fit.covariance is None:
+        return (
+            "the scale is not observable: the surface that both clouds share grows into itself (a "
+            "plane, a corner), so any scale fits. Scale the cloud by a known length or by control "
+            "points, or give it more in common with the other one."
+        )
+    return None
+
+
+def in_metres(found: ScaleSearch, source: Cloud, target: Cloud) -> tuple[Cloud, Cloud]:
+    """Return both clouds, the free one with the unit that was found."""
+    k = found.candidates[0].metres_per_unit
+    if found.side == "source":
+        return with_unit(source, k), target
+    return source, with_unit(target, k)
+
+
+def scale_document(found: ScaleSearch, source: Cloud, target: Cloud) -> dict[str, Any]:
+    """Return the search as plain data: per scale the loss of the metric cloud's structure."""
+    name = source.name if found.side == "source" else target.name
+    undecided = [c.metres_per_unit for c in found.undecided]
+    rows = [
+        {
+            "metres_per_unit": c.metres_per_unit,
+            "loss": c.loss,
+            "is_undecided": c.metres_per_unit in undecided,
+        }
+        for c in found.candidates
+    ]
+    best = found.candidates[0] if found.candidates else None
+    covariance = None if best is None else best.fit.covariance
+    return {
+        "cloud": name,
+        "side": found.side,
+        "metres_per_unit": None if best is None else best.metres_per_unit,
+        "sigma_ln": None if covariance is None else float(np.sqrt(covariance[6, 6])),
+        "candidates": rows,
+    }
+
+
+def with_scale(
+    result: Registration,
+    found: ScaleSearch,
+    clouds: tuple[Cloud, Cloud],
+    dof: int,
+    most_spread_m: float,
+) -> Registration:
+    """Return the rigid result of `in_metres` with its scale: covariance, doubt, words."""
+    source, target = clouds
+    best = found.candidates[0]
+    covariance = best.fit.covariance
+    assert covariance is not None
+    sigma = float(np.sqrt(covariance[6, 6]))
+    name = source.name if found.side == "source" else target.name
+    fine = result.fine
+    if fine is not None:
+        about = best.fit.centre
+        # The document gives it in the target's own frame, whose metres are not known yet.
+        about = about / best.metres_per_unit if found.side == "target" else about
+        fine = replace(fine, covariance=covariance, covariance_about=about)
+    status, reason = result.status, result.reason
+    doubt = _doubt(found, sigma, most_spread_m)
+    if status == "ok" and doubt is not None:
+        status, reason = "ambiguous", doubt
+    unit = f"one unit of {name} is {best.metres_per_unit:.6g} m (sigma {100 * sigma:.2g} %)"
+    notes = [note for note in result.notes if not note.startswith("units differ")]
+    return replace(
+        result,
+        status=status,
+        reason=reason,
+        fine=fine,
+        dof=dof,
+        scale_source="search",
+        scale_search=scale_document(found, source, target),
+        parameters={**result.parameters, "dof": dof},
+        notes=(*notes, f"the scale was searched: {unit}"),
+    )
+
+
+def _doubt(found: ScaleSearch, sigma: float, most_spread_m: float) -> str | None:
+    best = found.candidates[0]
+    if found.undecided:
+        shown = ", ".join(f"{c.metres_per_unit:.4g}" for c in (best, *found.undecided))
+        return (
+            f"several scales explain the clouds equally well: {shown} metres per unit. A known "
+            "length or control points would decide."
+        )
+    spread = 1.96 * sigma * best.fit.length_m
+    if spread > most_spread_m:
+        return (
+            f"the scale is held too weakly: its uncertainty of {196 * sigma:.2g} % (95 %) moves "
+            f"the shared surface by {spread:.2g} m, at most {most_spread_m:.2g} m expected."
+        )
+    return None
+
+
+def unit_found(search: Mapping[str, Any] | None, clouds: Sequence[Cloud]) -> tuple[Cloud, Cloud]:
+    """Return source and target, the one without a unit with that of a finished search."""
+    source, target = clouds
+    if search is None or search["metres_per_unit"] is None:
+        return source, target
+    k = search["metres_per_unit"]
+    return (
+        (with_unit(source, k), target)
+        if search["side"] == "source"
+        else (source, with_unit(target, k))
+    )

@@ -1,0 +1,277 @@
+"""Fine registration with the scale of one cloud as a seventh unknown, and how well it is held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from dougong.registration.covariance import blocks_of
+from dougong.registration.icp import Icp, Level, build_levels, centre_and_length
+from dougong.registration.icp_solve import (
+    gravity_prior,
+    levelled,
+    moved_by,
+    robust_weights,
+    robust_widening,
+    weighted_median,
+    with_prior,
+)
+from dougong.registration.overlap import Pairs, Rung, find_pairs
+from dougong.registration.prepare import Prepared
+from dougong.typing import Mask, Transform, Values
+
+FREE_WITH_SCALE = {5: (2, 3, 4, 5, 6), 7: (0, 1, 2, 3, 4, 5, 6)}
+"""Which of (omega, v, ln s) move, by degrees of freedom."""
+_LEAST_PAIRS = 60
+_FLOOR = 1e-5
+_LEAST_BLOCKS = 14
+_BLOCK_GROWTH = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
+_FACING = 0.3
+_LEAST_FACING_SHARE = 0.02
+_LEAST_FACING_BLOCKS = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimilarityFit:
+    """A pose and a factor of scale, fitted together."""
+
+    T_target_source: Transform
+    """Rigid, with the free cloud already multiplied by `factor`."""
+    factor: float
+    """Multiply the free cloud's lengths by this."""
+    covariance: NDArray[np.float64] | None
+    """(7, 7) of (omega rad, v m, ln s) about `centre`, block jackknife; None: too few blocks.
+    For x' = c + s Exp(omega)(x - c) + v; s scales the *source*, whichever cloud is free."""
+    centre: NDArray[np.float64]
+    """(3,), local target coordinates, metres."""
+    length_m: float
+    """Root-mean-square radius of the paired surface: what ln s moves by."""
+    holds_scale: bool
+    """False: growing, with whatever motion goes best with it, leaves the surface in itself."""
+
+
+def fit_similarity(
+    source: Prepared,
+    target: Prepared,
+    T: Transform,
+    side: Literal["source", "target"],
+    icp: Icp,
+    dof: int,
+) -> SimilarityFit | None:
+    """Fit pose and scale near `T`; distances are measured in metres of the cloud that stays.
+
+    Parameters
+    ----------
+    source, target : Prepared
+        The free one of them within about 3 % of its size.
+    T : ndarray, shape (4, 4)
+        Rigid, source local -> target local.
+    side : {"source", "target"}
+        Which cloud is free.
+    icp : Icp
+    dof : int
+        5 (levelled) or 7.
+
+    Returns
+    -------
+    SimilarityFit or None
+        None: the clouds have too little in common near `T`.
+    """
+    free = FREE_WITH_SCALE[dof]
+    if dof == 5:
+        T = levelled(T, target.xyz.mean(axis=0))
+    factor = 1.0
+    fitted = None
+    for number, level in enumerate(build_levels(source, target, _settings(icp, source, target))):
+        for _ in range(10):
+            fitted = _paired(_grown(level, factor, side), T, icp)
+            if fitted is None:
+                return None
+            step, length = _step(fitted, T, level, icp, free)
+            T, factor = _moved(T, factor, step, fitted.centre, side)
+            motion = length * (np.linalg.norm(step[:3]) + abs(step[6])) + np.linalg.norm(step[3:6])
+            if motion < (1e-3 if number < 2 else 2e-5):
+                break
+            if not 0.7 < factor < 1.4:
+                return None
+    fitted = _paired(_grown(level, factor, side), T, icp)
+    return None if fitted is None else _result(fitted, T, factor, icp, free)
+
+
+def _settings(icp: Icp, source: Prepared, target: Prepared) -> Icp:
+    spacing = max(source.spacing_m, target.spacing_m)
+    sigma = float(np.hypot(source.sigma_m, target.sigma_m))
+    last = icp.last_distance_m or max(1.5 * spacing, 4.0 * sigma)
+    return icp.model_copy(
+        update={
+            "levels": 3,
+            "points_per_level": 15_000,
+            "first_distance_m": max(1.5, 10 * spacing),
+            "last_distance_m": last,
+        }
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Fitted:
+    """The pairs of one pose, linearised."""
+
+    pairs: Pairs
+    weights: Values
+    rows: NDArray[np.float64]
+    """(k, 7) d residual / d (omega, v, ln s)."""
+    centre: NDArray[np.float64]
+    length: float
+    scale_m: float
+
+
+def _grown(level: Level, factor: float, side: str) -> Level:
+    """Return the level with its free cloud multiplied by `factor`."""
+    if side == "source":
+        return replace(level, source=_grown_rung(level.source, factor))
+    return replace(level, target=_grown_rung(level.target, factor))
+
+
+def _grown_rung(rung: Rung, factor: float) -> Rung:
+    xyz = rung.xyz * factor
+    return replace(rung, xyz=xyz, tree=cKDTree(xyz, balanced_tree=False))
+
+
+def _paired(level: Level, T: Transform, icp: Icp) -> _Fitted | None:
+    cosine = float(np.cos(np.radians(icp.normal_angle_deg)))
+    pairs = find_pairs(level.source, level.target, T, level.bound_m, cosine, both_ways=True)
+    if len(pairs.residuals) < _LEAST_PAIRS:
+        return None
+    distance = np.abs(pairs.residuals)
+    floor = max(float(np.hypot(level.source.sigma_m, level.target.sigma_m)), 1e-3 * level.bound_m)
+    scale = max(1.4826 * weighted_median(distance, pairs.weights), floor)
+    weights = pairs.weights * robust_weights(distance, scale, icp.robust)
+    centre, length = centre_and_length(pairs, weights)
+    arms = pairs.points - centre
+    growth = np.einsum("ij,ij->i", arms, pairs.normals)
+    rows = np.column_stack([np.cross(arms, pairs.normals), pairs.normals, growth])
+    return _Fitted(
+        pairs=pairs, weights=weights, rows=rows, centre=centre, length=length, scale_m=scale
+    )
+
+
+def _step(
+    fitted: _Fitted, T: Transform, level: Level, icp: Icp, free: Sequence[int]
+) -> tuple[NDArray[np.float64], float]:
+    """Return the Gauss-Newton step (7,) and the length that turns angles into metres."""
+    H = (fitted.rows * fitted.weights[:, None]).T @ fitted.rows
+    g = fitted.rows.T @ (fitted.weights * fitted.pairs.residuals)
+    sigma = float(np.radians(icp.gravity_sigma_deg if level.has_common_up else 10.0))
+    prior = gravity_prior(T[:3, :3] @ level.up_source, level.up_target, sigma)
+    H[:6, :6], g[:6] = with_prior(
+        H[:6, :6],
+        g[:6],
+        prior,
+        weight_sum=float(fitted.weights.sum()),
+        scale_m=fitted.scale_m,
+        blocks=blocks_of(fitted.pairs.points, icp.block_m)[1],
+    )
+    return _solved(H, g, free, fitted.length), fitted.length
+
+
+def _solved(
+    H: NDArray[np.float64], g: NDArray[np.float64], free: Sequence[int], length_m: float
+) -> NDArray[np.float64]:
+    """Return the step (7,) over the free unknowns; what has no information stays."""
+    chosen = list(free)
+    scale = np.array([length_m] * 3 + [1.0] * 3 + [length_m])[chosen]
+    values, vectors = np.linalg.eigh(H[np.ix_(chosen, chosen)] / np.outer(scale, scale))
+    is_stiff = values > _FLOOR * max(float(values[-1]), 1e-300)
+    inverse = np.where(is_stiff, 1.0 / np.where(is_stiff, values, 1.0), 0.0)
+    step = np.zeros(7)
+    step[chosen] = -(vectors @ (inverse * (vectors.T @ (g[chosen] / scale)))) / scale
+    return step
+
+
+def _moved(
+    T: Transform, factor: float, step: NDArray[np.float64], centre: NDArray[np.float64], side: str
+) -> tuple[Transform, float]:
+    """Return pose and factor after x' = c + s Exp(omega)(x - c) + v, one cloud scaled by it.
+
+    With x = T p: a free source takes the s (p grows to s p); for a free target everything is
+    divided by s instead, so that the source keeps its metres.
+    """
+    s = float(np.exp(step[6]))
+    turned = moved_by(T, np.concatenate([step[:3], np.zeros(3)]), np.zeros(3))
+    arm = turned[:3, 3] - turned[:3, :3] @ T[:3, :3].T @ centre
+    result = turned.copy()
+    result[:3, 3] = centre + step[3:6] + s * arm
+    if side == "source":
+        return result, factor * s
+    result[:3, 3] /= s
+    return result, factor / s
+
+
+def _result(
+    fitted: _Fitted, T: Transform, factor: float, icp: Icp, free: Sequence[int]
+) -> SimilarityFit:
+    covariance = _jackknife(fitted, free, icp.block_m)
+    pairs = fitted.pairs
+    widening = robust_widening(np.abs(pairs.residuals), pairs.weights, fitted.scale_m, icp.robust)
+    return SimilarityFit(
+        T_target_source=T,
+        factor=factor,
+        covariance=None if covariance is None else widening * covariance,
+        centre=fitted.centre,
+        length_m=fitted.length,
+        holds_scale=_holds_scale(fitted, free, icp.block_m),
+    )
+
+
+def _jackknife(fitted: _Fitted, free: Sequence[int], block_m: float) -> NDArray[np.float64] | None:
+    """Return the (7, 7) covariance by leaving blocks out, as `covariance.jackknife` does for 6."""
+    best: NDArray[np.float64] | None = None
+    unit = np.array([fitted.length] * 3 + [1.0] * 3 + [fitted.length])
+    for growth in _BLOCK_GROWTH:
+        block, count = blocks_of(fitted.pairs.points, block_m * growth)
+        if count < _LEAST_BLOCKS or (best is not None and growth < 1.0):
+            continue
+        H, g = np.zeros((count, 7, 7)), np.zeros((count, 7))
+        for b in range(count):
+            here = block == b
+            rows, weights = fitted.rows[here], fitted.weights[here]
+            H[b] = (rows * weights[:, None]).T @ rows
+            g[b] = rows.T @ (weights * fitted.pairs.residuals[here])
+        H_all, g_all = H.sum(axis=0), g.sum(axis=0)
+        steps = np.array(
+            [_solved(H_all - H[b], g_all - g[b], free, fitted.length) for b in range(count)]
+        )
+        steps -= steps.mean(axis=0)
+        covariance = (count - 1) / count * steps.T @ steps * ((count - 1) / (count - 8))
+        size = np.trace(covariance * np.outer(unit, unit))
+        if best is None or size > np.trace(best * np.outer(unit, unit)):
+            best = covariance
+    return best
+
+
+def _holds_scale(fitted: _Fitted, free: Sequence[int], block_m: float) -> bool:
+    """Say whether enough surface, in enough places, faces a change of scale.
+
+    The motion that goes best with growing is taken with it (all planes through one point grow
+    into themselves): what is left must be faced by surface, as `covariance.unobservable` asks.
+    """
+    weights, rows = fitted.weights, fitted.rows
+    others = [place for place in free if place != 6]
+    rigid = rows[:, others]
+    H = (rigid * weights[:, None]).T @ rigid
+    along = -np.linalg.pinv(H, hermitian=True) @ (rigid.T @ (weights * rows[:, 6]))
+    step = np.zeros(7)
+    step[others], step[6] = along, 1.0
+    arms = fitted.pairs.points - fitted.centre
+    motion = np.linalg.norm(np.cross(step[:3], arms) + step[3:6] + arms, axis=1)
+    facing: Mask = np.abs(rows @ step) > _FACING * np.maximum(motion, 0.3 * fitted.length)
+    block, count = blocks_of(fitted.pairs.points, block_m)
+    held = np.bincount(block[facing], weights[facing], count)
+    total = float(weights.sum())
+    is_spread = int((held > 0.02 * total / count).sum()) >= min(_LEAST_FACING_BLOCKS, count)
+    return bool(float(weights[facing].sum()) >= _LEAST_FACING_SHARE * total and is_spread)
