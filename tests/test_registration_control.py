@@ -1,5 +1,7 @@
 """Control points: adjusted by their sigmas, decide what clouds cannot, never hide a wrong pose."""
 
+import json
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -327,6 +329,58 @@ def test_quality_needs_every_registration_checked_and_fine_enough():
     assert quality_document("LOA10", both)["is_reached"] is True
     assert quality_document("LOA10", [*both, document("c", None)])["is_reached"] is False
     assert quality_document(None, both)["is_reached"] is None
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory):
+    """A scan, a drone cloud and a control file, in a folder."""
+    folder = tmp_path_factory.mktemp("survey")
+    T = motion()
+    T[:3, 3] += MAP
+    scan = apply(np.linalg.inv(motion()), site("lidar", 1, per_m2=150.0))
+    write(Cloud.from_points(scan), folder / "scan.laz")
+    write(Cloud.from_points(site("photogrammetry", 2, per_m2=60.0) + MAP), folder / "drone.laz")
+    csv_of(folder / "control.csv", points(T, places=PLACES + MAP))
+    return folder
+
+
+def test_register_writes_checks(survey, capsys):
+    out = survey / "out"
+    files = [str(survey / "scan.laz"), str(survey / "drone.laz")]
+    files += ["--target-kind", "photogrammetry", "--filtered"]
+    code = call(["register", *files, "--out", str(out), "--control", str(survey / "control.csv")])
+    document = json.loads((out / "registration.json").read_text())
+    assert code == 0, document["reason"]
+    checks = document["checks"]
+    assert checks["check"]["points"] == 2
+    assert checks["level"] in ("LOA20", "LOA10")
+    assert [p["name"] for p in checks["points"]] == [f"P{k}" for k in range(7)]
+    assert "check RMSE" in capsys.readouterr().out
+
+
+PROJECT = """
+[[cloud]]
+name = "scan"
+kind = "lidar"
+files = ["scan.laz"]
+[[cloud]]
+name = "drone"
+kind = "photogrammetry"
+files = ["drone.laz"]
+[register.prepare]
+min_spacing_m = 0.2
+[quality]
+"""
+
+
+@pytest.mark.parametrize(("level", "code"), [("LOA10", 0), ("LOA50", 3)])
+def test_a_project_says_whether_it_reaches_its_level(survey, tmp_path, level, code):
+    project = survey / f"{level}.toml"
+    project.write_text(PROJECT + f'control = "control.csv"\nrequired_level = "{level}"\n')
+    assert call(["run", str(project), "--out", str(tmp_path / "out"), "--quiet"]) == code
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["status"] == "ok"
+    assert result["quality"]["is_reached"] == (code == 0)
 
 
 def test_a_level_without_check_points_is_refused(tmp_path, capsys):
