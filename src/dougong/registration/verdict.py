@@ -55,10 +55,10 @@ class Verdict(Parameters):
     half a metre beside it."""
     most_violation: Annotated[float, Field(ge=0, le=1)] = 0.08
     """Share of the structure that may stand where the other cloud saw free space."""
-    most_spread_m: Annotated[float, Field(gt=0)] = 0.06
-    """How far the blocks' disagreement may reach, as TRE95 of the shared surface (95 % sure):
-    50 mm is what METHOD.md 5 calls correct, and the estimate itself is good to a fifth. Thin or
-    rough clouds find the place, but not that closely, and are told so."""
+    most_spread_m: Annotated[float, Field(gt=0)] = 0.05
+    """By how much the blocks may disagree about the pose, as 95 % displacement of the shared
+    surface: 50 mm is what METHOD.md 5 calls correct. Thin or rough clouds find the place, but not
+    that closely, and are told so."""
     poses: Annotated[int, Field(ge=1)] = 8
     """So many coarse hypotheses are refined."""
     neighbours: Annotated[int, Field(ge=0)] = 4

@@ -64,6 +64,8 @@ class Link:
     margin: float
     unobservable: tuple[str, ...]
     history_mm: tuple[float, ...]
+    points: tuple[Mapping[str, Any], ...]
+    """Control and check points: name, role, residual in millimetres, remark."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +76,8 @@ class Report:
     subtitle: str
     verdict: Verdict
     key_numbers: tuple[KeyNumber, ...]
-    checks: str
+    checks: tuple[str, ...]
+    """What is known of the accuracy, one sentence per registration; or that nothing is."""
     clouds: tuple[CloudRow, ...]
     links: tuple[Link, ...]
     notes: tuple[str, ...]
@@ -94,7 +97,7 @@ def from_run(result: Mapping[str, Any], demo: Mapping[str, Any] | None) -> Repor
         subtitle=_subtitle(result),
         verdict=_run_verdict(result, demo),
         key_numbers=_key_numbers(result, demo),
-        checks=NO_CHECKS,
+        checks=_accuracy(result["registrations"], result.get("quality")),
         clouds=tuple(_cloud(cloud) for cloud in result["clouds"]),
         links=links,
         notes=tuple(result["notes"]),
@@ -123,7 +126,7 @@ def from_registration(document: Mapping[str, Any]) -> Report:
         subtitle="Registration of two clouds",
         verdict=Verdict(tone=only.tone, word=only.word, sentence=_plain(document)),
         key_numbers=tuple(_pair_numbers([document])),
-        checks=NO_CHECKS,
+        checks=_accuracy([document], None),
         clouds=(),
         links=(only,),
         notes=tuple(document["notes"]),
@@ -362,7 +365,58 @@ def link(document: Mapping[str, Any]) -> Link:
         margin=document["coarse"]["margin"],
         unobservable=tuple(direction["text"] for direction in document["unobservable"]),
         history_mm=tuple(1000 * value for value in history if value is not None),
+        points=tuple(_points(document.get("checks"))),
     )
+
+
+def _points(checks: Mapping[str, Any] | None) -> list[dict[str, str]]:
+    """Return control and check points as words: name, role, residual, remark."""
+    if checks is None:
+        return []
+    return [
+        {
+            "name": point["name"],
+            "role": point["role"],
+            "residual": _millimetres(point["residual_m"]),
+            "sigma": _millimetres(point["sigma_m"]),
+            "remark": (
+                "held out"
+                if point["role"] == "check"
+                else "adjusted with the clouds"
+                if point["is_used"]
+                else "left out: contradicts the others"
+            ),
+        }
+        for point in checks["points"]
+    ]
+
+
+def _millimetres(metres: float | None) -> str:
+    return "-" if metres is None else f"{1000 * metres:.1f} mm"
+
+
+def _accuracy(
+    documents: Sequence[Mapping[str, Any]], quality: Mapping[str, Any] | None
+) -> tuple[str, ...]:
+    """Return what check points prove, one sentence per registration, or that none were given."""
+    checked = [d for d in documents if (d.get("checks") or {}).get("check")]
+    if not checked:
+        return (NO_CHECKS,)
+    said = []
+    for document in checked:
+        check = document["checks"]["check"]
+        level = check["level"] or "coarser than LOA10"
+        points = f"{check['points']} check point{'s' if check['points'] != 1 else ''}"
+        said.append(
+            f"{document['source']}: {points} that had no part in the fit lie "
+            f"{_millimetres(check['check_rmse_m'])} (check RMSE, three dimensions) from their "
+            f"places; with 95 % confidence 95 % of the errors are below "
+            f"{_millimetres(check['upper95_m'])}: {level} (USIBD)."
+        )
+    if quality is not None and quality["required_level"] is not None:
+        is_reached = "is" if quality["is_reached"] else "is NOT"
+        said.append(f"The required level, {quality['required_level']}, {is_reached} reached.")
+    return tuple(said)
 
 
 def _matrix(matrix: Sequence[Sequence[float]] | None) -> tuple[tuple[str, ...], ...]:
