@@ -206,7 +206,7 @@ def test_every_key_number_has_a_definition_and_no_grade_is_stated():
     for report in (from_run(one, None), from_run(one, demo), from_run(run_result(), None)):
         assert len(report.key_numbers) == 3
         assert all(len(number.definition) > 15 for number in report.key_numbers)
-        assert "no accuracy grade is stated" in report.checks
+        assert "no accuracy grade is stated" in report.checks[0]
     shown = from_run(one, demo).key_numbers
     assert [(number.value, number.unit) for number in shown] == [
         ("4.8", "mm"), ("0.0043", "deg"), ("11.9", "mm"),
