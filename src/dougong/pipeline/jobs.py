@@ -56,7 +56,7 @@ from dougong.pipeline.tiled import (
     stations_of,
 )
 from dougong.registration import Register
-from dougong.registration.free_scale_result import unit_found
+from dougong.registration.free_scale_result import in_found_unit
 from dougong.typing import Kind
 
 DISTANCES = "distances.laz"
@@ -393,8 +393,8 @@ def register_files(
     measured = None
     if result.status == "ok" or params.accept_best:
         progress.stage(f"measuring {source.name} against {target.name}")
-        one, two = unit_found(result.scale_search, clouds)
-        measured = measure(one, two, result)
+        one, two, metric = in_found_unit(result, clouds)
+        measured = measure(one, two, metric)
     if measured is not None:
         write_distances(measured, out / DISTANCES)
     document |= {

@@ -123,8 +123,8 @@ def signed_distances(
     source, target : ndarray, shape (n, 3) and (m, 3)
         Metres, in one local frame; the source moved by its registration.
     params : Distances, optional
-    covariance : ndarray, shape (6, 6), optional
-        Of (omega rad, v m), the pose's, about `covariance_about` (3,) in that frame.
+    covariance : ndarray, shape (6, 6) or (7, 7), optional
+        Of (omega rad, v m[, ln s]), the pose's, about `covariance_about` (3,) in that frame.
     core : ndarray, shape (k, 3), optional
         Core points; by default the source, thinned, where the target is near.
     normals : ndarray, shape (k, 3), optional
@@ -278,7 +278,11 @@ def _along_normals(
     if covariance is None or about is None:
         return np.zeros(len(core))
     # n . (omega x arm + v) = (arm x n) . omega + n . v
-    rows = np.concatenate([np.cross(core - about, normals), normals], axis=1)
+    arms = core - about
+    rows = np.concatenate([np.cross(arms, normals), normals], axis=1)
+    if covariance.shape == (7, 7):
+        # Growing by ln s moves a point by its arm.
+        rows = np.column_stack([rows, np.einsum("ij,ij->i", arms, normals)])
     variance = np.einsum("ki,ij,kj->k", rows, covariance, rows)
     sigma: Values = np.sqrt(np.clip(variance, 0.0, None))
     return sigma

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -117,14 +117,17 @@ def _doubt(found: ScaleSearch, sigma: float, most_spread_m: float) -> str | None
     return None
 
 
-def unit_found(search: Mapping[str, Any] | None, clouds: Sequence[Cloud]) -> tuple[Cloud, Cloud]:
-    """Return source and target, the one without a unit with that of a finished search."""
+def in_found_unit(
+    result: Registration, clouds: Sequence[Cloud]
+) -> tuple[Cloud, Cloud, Registration]:
+    """Return both clouds in metres, and the result with its covariance about a place in them."""
     source, target = clouds
+    search, fine = result.scale_search, result.fine
     if search is None or search["metres_per_unit"] is None:
-        return source, target
+        return source, target, result
     k = search["metres_per_unit"]
-    return (
-        (with_unit(source, k), target)
-        if search["side"] == "source"
-        else (source, with_unit(target, k))
-    )
+    if search["side"] == "source":
+        return with_unit(source, k), target, result
+    if fine is not None:
+        result = replace(result, fine=replace(fine, covariance_about=fine.covariance_about * k))
+    return source, with_unit(target, k), result
