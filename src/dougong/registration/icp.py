@@ -21,6 +21,7 @@ from dougong.registration.icp_solve import (
     moved_by,
     normal_equations,
     robust_weights,
+    robust_widening,
     solve,
     weighted_median,
     with_prior,
@@ -271,9 +272,12 @@ def _result(
     covariance, blocks, rmse, fitness = None, 0, float("nan"), 0.0
     loose: tuple[Mapping[str, Any], ...] = ()
     if is_enough:
-        weights, _ = _weights(pairs, level, params)
+        weights, scale = _weights(pairs, level, params)
         centre, length = centre_and_length(pairs, weights)
         covariance, blocks = jackknife(pairs, weights, centre, params.dof, length, params.block_m)
+        if covariance is not None:
+            distance = np.abs(_distance(pairs, params))
+            covariance *= robust_widening(distance, pairs.weights, scale, params.robust)
         loose = unobservable(pairs, weights, centre, params.dof, length, params.block_m)
         is_inlier = weights > 0.0
         rmse = _rms(_distance(pairs, params)[is_inlier], pairs.weights[is_inlier])
