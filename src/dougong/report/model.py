@@ -101,21 +101,29 @@ def from_run(result: Mapping[str, Any], demo: Mapping[str, Any] | None) -> Repor
         clouds=tuple(_cloud(cloud) for cloud in result["clouds"]),
         links=links,
         notes=tuple(result["notes"]),
-        outputs=(
-            ("merged.copc.laz", _merged(result["merged"])),
-            ("distances/", "the core points with their signed distances"),
-            ("clouds/", "each filtered cloud in the frame of the reference"),
-            (
-                "registrations/",
-                "the transform of each cloud, both ways, with its proof; beside it for "
-                "CloudCompare, PDAL and Metashape",
-            ),
-            ("result.json", "everything on this page for machines"),
-        ),
+        outputs=tuple(_outputs(result)),
         inputs=tuple(result["inputs"]),
         parameters=tuple(flat(result["parameters"])),
         provenance=_provenance(result),
     )
+
+
+def _outputs(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the files of a run and what each is."""
+    rows = [
+        ("merged.copc.laz", _merged(result["merged"])),
+        ("clouds/", "each filtered cloud in the frame of the reference"),
+        (
+            "registrations/",
+            "the transform of each cloud, both ways, with its proof; beside it for "
+            "CloudCompare, PDAL and Metashape",
+        ),
+        ("distances/", "what is left between the clouds: signed distances with their detection"),
+        ("removed/", "a sample of the removed points, each with its reason"),
+    ]
+    if result.get("full_resolution"):
+        rows.append(("full/", "every input file, undecimated, in the frame of the reference"))
+    return [*rows, ("result.json", "everything on this page for machines")]
 
 
 def from_registration(document: Mapping[str, Any]) -> Report:
