@@ -93,7 +93,7 @@ def make_scene(
     return survey(kind, seed, world, surveyor, pilot, bending, max_tilt_deg, tracer, on_map)
 
 
-def _world(kind: str, seed: int, site: bool, woods: bool) -> tuple[World, Tracer]:
+def _world(kind: str, seed: int, site: bool, woods: bool = False) -> tuple[World, Tracer]:
     """Return what the sensors meet, and the tracer of its still part."""
     building = BUILDERS[kind](stream(seed, f"{kind} building"), is_symmetric=not site)
     if not site:
