@@ -182,6 +182,7 @@ def test_view_streams_clouds_from_this_computer_only(browser, served):  # noqa: 
     opened.tab.get_by_label("small.ply").uncheck()
     assert change(first, opened.picture()) > 0.01
     opened.tab.get_by_label("small.ply").check()
+    settled(opened)
     origin = np.array(opened.state("s.scene.origin"))
     opened.tab.evaluate("() => { dougongViewer.tools.choose('measure'); }")
     for beacon in BEACONS:
