@@ -1,0 +1,134 @@
+"""One registration as rows of words and numbers."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dougong.report.verdict import TONES, WORDS, Tone, millimetres, sentence
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Link:
+    """One registration, ready to be laid out."""
+
+    source: str
+    target: str
+    tone: Tone
+    word: str
+    reason: str
+    facts: tuple[tuple[str, str], ...]
+    """Name and value, both with their units."""
+    matrix: tuple[tuple[str, ...], ...]
+    hypotheses: tuple[Mapping[str, Any], ...]
+    margin: float
+    unobservable: tuple[str, ...]
+    history_mm: tuple[float, ...]
+    points: tuple[Mapping[str, Any], ...]
+    """Control and check points: name, role, residual in millimetres, remark."""
+
+
+def link(document: Mapping[str, Any]) -> Link:
+    """Return one registration document as rows of words and numbers."""
+    tone = TONES[document["status"]]
+    fine = document["fine"]
+    history = [step.get("inlier_rmse_m") for step in (fine or {}).get("history", [])]
+    return Link(
+        source=document["source"],
+        target=document["target"],
+        tone=tone,
+        word=WORDS[tone],
+        reason=sentence(document["reason"]),
+        facts=tuple(_facts(document)),
+        matrix=_matrix(document["matrix"]),
+        hypotheses=tuple(document["coarse"]["hypotheses"][:8]),
+        margin=document["coarse"]["margin"],
+        unobservable=tuple(direction["text"] for direction in document["unobservable"]),
+        history_mm=tuple(1000 * value for value in history if value is not None),
+        points=tuple(_points(document.get("checks"))),
+    )
+
+
+def _points(checks: Mapping[str, Any] | None) -> list[dict[str, str]]:
+    """Return control and check points as words: name, role, residual, remark."""
+    if checks is None:
+        return []
+    return [
+        {
+            "name": point["name"],
+            "role": point["role"],
+            "residual": millimetres(point["residual_m"]),
+            "sigma": millimetres(point["sigma_m"]),
+            "remark": (
+                "held out"
+                if point["role"] == "check"
+                else "adjusted with the clouds"
+                if point["is_used"]
+                else "left out: contradicts the others"
+            ),
+        }
+        for point in checks["points"]
+    ]
+
+
+def _matrix(matrix: Sequence[Sequence[float]] | None) -> tuple[tuple[str, ...], ...]:
+    """Return a matrix as text: ten digits of rotation, a tenth of a millimetre of shift."""
+    rows = [[*(f"{value:.10f}" for value in row[:3]), f"{row[3]:.4f}"] for row in matrix or ()]
+    return tuple(map(tuple, rows))
+
+
+def _facts(document: Mapping[str, Any]) -> list[tuple[str, str]]:
+    coarse, fine = document["coarse"], document["fine"]
+    facts = [
+        ("coarse method", f"{coarse['method']}, {len(coarse['hypotheses'])} hypotheses"),
+        ("degrees of freedom", f"{document['dof']}"),
+        ("scale", _scale(document)),
+        ("probability that it is this pose", f"{document['probability']:.3f}"),
+    ]
+    if fine:
+        rmse = fine["inlier_rmse_m"]
+        bound = f"within {1000 * fine['max_distance_m']:.0f} mm"
+        facts += [
+            (
+                "fine method",
+                f"{fine['method']}, {fine['iterations']} iterations: {fine['stopped']}",
+            ),
+            ("inlier RMSE", f"{1000 * rmse:.2f} mm, {bound}" if rmse is not None else "none"),
+            ("fitness (inliers / source points)", f"{fine['fitness']:.3f}"),
+            ("overlap of source, of target", _overlap(fine, bound)),
+        ]
+    spread = _spread(document["covariance"])
+    if spread:
+        facts.append(("standard deviation of the fit", spread))
+    return facts
+
+
+def _scale(document: Mapping[str, Any]) -> str:
+    """Return the scale of the matrix and what fixes it; documents before 0.2 do not say it."""
+    scale = f"{document['scale']:.9g}"
+    search, grid = document.get("scale_search"), document.get("grid")
+    if search and search["sigma_ln"] is not None:
+        scale += (
+            f", searched: one unit of {search['cloud']} is {search['metres_per_unit']:.6g} m "
+            f"(sigma {100 * search['sigma_ln']:.2g} %)"
+        )
+    if grid:
+        scale += (
+            f", known from the map projection ({grid['ppm']:+.1f} ppm in plan, "
+            f"{'as given' if grid['from'] == 'given' else 'by the coordinate system'}; heights "
+            f"off by at most {1000 * grid['height_error_m']:.1f} mm for it)"
+        )
+    return scale
+
+
+def _overlap(fine: Mapping[str, Any], bound: str) -> str:
+    return f"{100 * fine['overlap_source']:.1f} %, {100 * fine['overlap_target']:.1f} % ({bound})"
+
+
+def _spread(covariance: Sequence[Sequence[float]] | None) -> str:
+    if covariance is None:
+        return ""
+    sigma = np.sqrt(np.maximum(np.diag(np.array(covariance)), 0.0))
+    turn, shift = np.degrees(np.linalg.norm(sigma[:3])), 1000 * np.linalg.norm(sigma[3:6])
+    return f"{turn:.4f} deg, {shift:.1f} mm, at the middle of the overlap"
