@@ -23,6 +23,8 @@ _SUBTREES = 32
 """Parts of the tree that are built apart, on the threads."""
 _BLOCK = 32_768
 """Queries per task: fixed, so results do not depend on the thread count."""
+_SEARCHES = 4096
+"""The same for `nearest`, which a fit asks many times for few points: enough work for a task."""
 
 
 class Neighbourhood(NamedTuple):
@@ -165,7 +167,7 @@ def nearest(
         distance[rows] = np.sqrt(distance2)
 
     if len(index.points):
-        for_blocks(len(asked), _BLOCK, task)
+        for_blocks(len(asked), _SEARCHES, task)
     return found, distance
 
 

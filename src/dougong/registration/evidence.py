@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong.filters import neighbourhood
 from dougong.registration.overlap import (
     Rung,
     apply,
     do_agree,
     inverse,
-    nearest,
     rung,
 )
 from dougong.registration.prepare import Prepared
@@ -189,8 +189,8 @@ def _hear_one(
     moved = apply(T, from_.points)
     normals = from_.normals @ T[:3, :3].T
     reach = tolerance_m + _RAMP_M
-    distance, index = nearest(to.everything.tree, moved, 2.0 * reach)
-    is_near = np.isfinite(distance)
+    index, distance = neighbourhood.nearest(to.everything.neighbours, moved, 2.0 * reach)
+    is_near = index >= 0
     index = np.where(is_near, index, 0)
     other = to.everything.normals[index]
     offset = moved - to.everything.xyz[index]

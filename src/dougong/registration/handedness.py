@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from dougong.filters.neighbourhood import build_index
 from dougong.registration.evidence import Court, Testimony, Witness, hear
 from dougong.registration.icp import Icp, Level, refine_levels
 from dougong.registration.overlap import Rung
@@ -78,5 +78,5 @@ def _mirrored_witness(witness: Witness) -> Witness:
 
 def _mirrored_rung(rung: Rung) -> Rung:
     xyz = rung.xyz * _FLIP
-    tree = cKDTree(xyz, balanced_tree=False)
-    return replace(rung, xyz=xyz, normals=rung.normals * _FLIP, tree=tree)
+    neighbours = build_index(xyz)
+    return replace(rung, xyz=xyz, normals=rung.normals * _FLIP, neighbours=neighbours)

@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong.filters import neighbourhood
 from dougong.registration.evidence import Court, Testimony
 from dougong.registration.icp_solve import rotation_of
-from dougong.registration.overlap import apply, do_agree, nearest
+from dougong.registration.overlap import apply, do_agree
 from dougong.typing import Mask, Points, Transform, Values
 
 SAME_YAW_DEG = 5.0
@@ -252,8 +253,8 @@ def _quick_score(
 ) -> float:
     """Return how near `points` (n, 3) come to like surfaces within `reach_m` after `move`."""
     everything = court.target.everything
-    distance, index = nearest(everything.tree, apply(move, points), reach_m)
-    is_near = np.isfinite(distance)
+    index, distance = neighbourhood.nearest(everything.neighbours, apply(move, points), reach_m)
+    is_near = index >= 0
     turned = normals @ move[:3, :3].T
     other = everything.normals[np.where(is_near, index, 0)]
     closeness = np.where(is_near, 1.0 - distance / reach_m, 0.0)

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from dougong.filters.neighbourhood import build_index
 from dougong.registration.covariance import blocks_of
 from dougong.registration.icp import Icp, Level, build_levels, centre_and_length
 from dougong.registration.icp_solve import (
@@ -139,7 +139,7 @@ def _grown(level: Level, factor: float, side: str) -> Level:
 
 def _grown_rung(rung: Rung, factor: float) -> Rung:
     xyz = rung.xyz * factor
-    return replace(rung, xyz=xyz, tree=cKDTree(xyz, balanced_tree=False))
+    return replace(rung, xyz=xyz, neighbours=build_index(xyz))
 
 
 def _paired(level: Level, T: Transform, icp: Icp) -> _Fitted | None:
