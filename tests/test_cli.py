@@ -358,8 +358,8 @@ def test_ctrl_c_while_the_program_loads_is_heard(flags):
 
 
 def test_a_folder_that_may_not_be_written_is_refused_before_the_work(room, capsys, monkeypatch):
-    monkeypatch.setattr("dougong.pipeline.jobs.os.access", lambda *_: False)
-    monkeypatch.setattr("dougong.pipeline.jobs.read", None)  # nothing is read
+    monkeypatch.setattr("dougong.pipeline.outputs.os.access", lambda *_: False)
+    monkeypatch.setattr("dougong.pipeline.filtering.read", None)  # nothing is read
     tokens = ["filter", str(room), str(room.with_name("o.laz")), "--kind", "lidar", "--quiet"]
     assert call(tokens) == 1
     assert "may not be written by this user" in capsys.readouterr().err

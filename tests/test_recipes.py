@@ -11,7 +11,7 @@ from dougong.cli import call
 from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.filters.selection import NOISE, Reason
-from dougong.pipeline.jobs import filter_job
+from dougong.pipeline.filtering import filter_job
 from dougong.pipeline.marking import marked
 from dougong.pipeline.recipes import Recipe, filter_cloud
 from dougong.pipeline.single import filter_name, filter_single, single_parameters

@@ -14,10 +14,10 @@ from dougong.registration.congruent_sets import (
     four_pcs,
     pairs_of,
 )
-from dougong.registration.pair import coarse_poses
 from dougong.registration.pose_search import build_field, to_transform, view_of
 from dougong.registration.prepare import prepare
 from dougong.registration.sample_consensus import SacIa, consensus_poses, sac_ia
+from dougong.registration.starting_poses import coarse_poses
 from dougong.registration.surface import surface
 from object_shapes import chair, errors, motion, moved
 from reference import poses as twin

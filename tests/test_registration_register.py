@@ -12,7 +12,7 @@ import dougong
 from dougong.cloud import Cloud, Frame
 from dougong.errors import FrameError
 from dougong.registration import Register, register, registration_to_json
-from dougong.registration.pair import to_file_transform
+from dougong.registration.file_coordinates import to_file_transform
 
 
 def rigid(seed):

@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dougong.registration.decision import decide
 from dougong.registration.evidence import hear, sharpness, summon, support
 from dougong.registration.handedness import handedness
 from dougong.registration.icp import Icp, build_levels
-from dougong.registration.pair import Register, decide
 from dougong.registration.prepare import Prepared
 from dougong.registration.result import Hypothesis
 from dougong.registration.rivals import is_same
 from dougong.registration.sanity import mirrored
+from dougong.registration.settings import Register
 from dougong.registration.verdict import Verdict, compare
 
 SPACING = 0.25

@@ -47,7 +47,7 @@ def register_clouds(
     source_kind: Kind = "lidar",
     target_kind: Kind = "photogrammetry",
 ) -> Registration:
-    """Register `source` onto `target`; see `dougong.pipeline.registering.register`."""
+    """Register `source` onto `target`; see `dougong.registration.register`."""
     from dougong.pipeline.registering import register
 
     return register(source, target, params, source_kind=source_kind, target_kind=target_kind)
@@ -136,14 +136,14 @@ def filter_file(
     memory_bytes: int | None,
     progress: Progress,
 ) -> Document:
-    """Filter one file into another; see `dougong.pipeline.jobs.filter_file`."""
-    from dougong.pipeline import jobs
+    """Filter one file into another; see `dougong.pipeline.filtering.filter_file`."""
+    from dougong.pipeline import filtering
 
     _say_if_cold(progress)
-    return jobs.filter_file(
+    return filtering.filter_file(
         input,
         output,
-        job=jobs.filter_job(kind, only, settings),
+        job=filtering.filter_job(kind, only, settings),
         mark=mark,
         overwrite=overwrite,
         memory_bytes=memory_bytes,
@@ -161,10 +161,10 @@ def transform_file(
     memory_bytes: int | None,
     progress: Progress,
 ) -> Document:
-    """Move one file by a registration; see `dougong.pipeline.jobs.transform_file`."""
-    from dougong.pipeline import jobs
+    """Move one file by a registration; see `dougong.pipeline.moving.transform_file`."""
+    from dougong.pipeline.moving import transform_file as verb
 
-    return jobs.transform_file(
+    return verb(
         input,
         output,
         matrix,
@@ -207,14 +207,14 @@ def register_files(
     crs : pair of str, optional
         Reference systems of a source and a target whose files name none.
     """
-    from dougong.pipeline import jobs
     from dougong.pipeline.outputs import refuse_existing, result_folder
+    from dougong.pipeline.registering_files import register_files as verb
 
     out = _named(out)
     refuse_existing([out / "registration.json"], overwrite)
     _say_if_cold(progress)
     with result_folder(out) as part:
-        document = jobs.register_files(
+        document = verb(
             source,
             target,
             part,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dougong.errors import InputError, OutputError
-from dougong.formats import part_of
+from dougong.formats import WRITABLE, part_of
 
 _unfinished: set[Path] = set()
 
@@ -38,6 +38,35 @@ def refuse_existing(paths: Sequence[Path], overwrite: bool) -> None:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
         msg = f"{found[0]} exists already{more}. Choose another name or pass --overwrite."
         raise InputError(msg)
+
+
+def refuse_output(input: Path, output: Path, files: Sequence[Path], overwrite: bool) -> None:
+    """Refuse an output that could not be written, before any work is done.
+
+    Raises
+    ------
+    InputError
+        It is the input, one of `files` exists already, the folder is missing, or the suffix is
+        not one that is written.
+    OutputError
+        The folder may not be written.
+    """
+    if output.exists() and input.exists() and output.samefile(input):
+        msg = f"{output} is the input itself; inputs are never overwritten. Name another output."
+        raise InputError(msg)
+    if output.is_dir():
+        msg = f"{output} is a folder. Name a file in it."
+        raise InputError(msg)
+    refuse_existing(files, overwrite)
+    if not output.name.lower().endswith(WRITABLE):
+        msg = f"{output.name} cannot be written: clouds are written as {', '.join(WRITABLE)}."
+        raise InputError(msg)
+    if not output.parent.is_dir():
+        msg = f"{output.parent} is not a folder, so {output.name} cannot be written. Make it first."
+        raise InputError(msg)
+    if not os.access(output.parent, os.W_OK):
+        msg = f"{output.parent} may not be written by this user. Change its permissions."
+        raise OutputError(msg)
 
 
 def write_text(path: Path, text: str) -> None:

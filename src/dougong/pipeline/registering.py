@@ -14,6 +14,7 @@ from dougong.pipeline.ground import pair_on_ground, to_file
 from dougong.registration import Register
 from dougong.registration import register as search
 from dougong.registration.control import ControlPoints
+from dougong.registration.file_coordinates import unit_of
 from dougong.registration.picked_pairs import PickedPairs
 from dougong.registration.result import Registration
 from dougong.typing import Kind
@@ -33,24 +34,10 @@ def register(
     pairs: PickedPairs | None = None,
     control: ControlPoints | None = None,
 ) -> Registration:
-    """Find the motion from `source`'s file coordinates to `target`'s, and say how sure it is.
+    """Register two clouds, with what their reference systems say of units, maps and heights.
 
-    Parameters
-    ----------
-    source, target : Cloud
-        Raw or filtered; thinned and cleaned for the search, never changed.
-    params : Register, optional
-    source_kind, target_kind : {"lidar", "photogrammetry"}
-        What a sensor can and cannot see decides what counts as a contradiction.
-    pairs : PickedPairs, optional
-        Places picked in both clouds, in file coordinates: one more pose for the proof to hear.
-    control : ControlPoints, optional
-        Places surveyed in both frames, in file coordinates: adjusted with the clouds or held out.
-
-    Returns
-    -------
-    Registration
-        Status ``ok``, ``ambiguous`` or ``failed`` with a reason in words.
+    Parameters and result are those of `dougong.registration.register`; pairs and control points
+    are in file coordinates.
 
     Raises
     ------
@@ -58,13 +45,10 @@ def register(
         A cloud is in degrees or earth-centred coordinates, its heights have another unit than its
         plan, its easting and northing are swapped, or its map distorts the site.
     InputError
-        A grid scale is given, and neither cloud is in a map projection.
+        A grid scale is given, and neither cloud is in a map projection; or the pairs or control
+        points do not belong to these clouds.
     RegistrationError
         A cloud has too few points, or is not levelled.
-
-    Notes
-    -----
-    Deterministic; independent of thread count, point order and coordinate offset.
     """
     for cloud in (source, target):
         require_metric(cloud)
@@ -128,13 +112,7 @@ def require_registrable(cloud: Cloud) -> None:
         Heights have another unit than the plan (no similarity joins such a file to another), x is
         a northing, or lengths on the map depend on their direction.
     """
-    unit = cloud.frame.unit_m
-    if max(unit) - min(unit) > 1e-12:
-        msg = (
-            f"{cloud.name} has heights in units of {unit[2]:.6g} m and plan coordinates in units "
-            f"of {unit[0]:.6g} m; one unit is needed. Convert the heights first."
-        )
-        raise FrameError(msg)
+    unit_of(cloud)
     if not len(cloud):
         return
     middle = cloud.frame.to_file(np.median(cloud.xyz, axis=0)[None])[0]

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
         register_object,
     )
     from dougong.registration.icp import Icp, refine
-    from dougong.registration.pair import Register, register
+    from dougong.registration.pair import register
     from dougong.registration.prepare import Prepare, Prepared
     from dougong.registration.result import FineResult, Hypothesis, Registration
+    from dougong.registration.settings import Register
 
 _HOME = {
     "FineResult": "result",
@@ -29,7 +30,7 @@ _HOME = {
     "ObjectRegistration": "free_rotation",
     "Prepare": "prepare",
     "Prepared": "prepare",
-    "Register": "pair",
+    "Register": "settings",
     "Registration": "result",
     "refine": "icp",
     "register": "pair",

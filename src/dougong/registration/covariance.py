@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.registration.icp_solve import FREE, normal_equations, solve
+from dougong.registration.icp_solve import FREE, normal_equations, plane_rows, solve
 from dougong.registration.overlap import Pairs
 from dougong.typing import Index, Points, Values
 
@@ -91,7 +91,7 @@ def unobservable(
     if total <= 0.0:
         return ()
     arms = pairs.points - centre
-    rows = np.concatenate([np.cross(arms, pairs.normals) / length_m, pairs.normals], axis=1)
+    rows = plane_rows(arms / length_m, pairs.normals)
     free = list(FREE[dof])
     values, vectors = np.linalg.eigh((rows[:, free] * weights[:, None]).T @ rows[:, free])
     block, count = blocks_of(pairs.points, block_m)

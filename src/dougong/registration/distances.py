@@ -23,6 +23,7 @@ from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid
 from dougong.kernels import m3c2
 from dougong.params import Parameters
 from dougong.registration.cleaning import extent, in_some_blocks, sensor_noise
+from dougong.registration.icp_solve import plane_rows
 from dougong.threads import for_blocks
 from dougong.typing import Index, Mask, Points, Values
 
@@ -277,12 +278,7 @@ def _along_normals(
     """Return the standard deviation of the pose along each normal, metres (k,)."""
     if covariance is None or about is None:
         return np.zeros(len(core))
-    # n . (omega x arm + v) = (arm x n) . omega + n . v
-    arms = core - about
-    rows = np.concatenate([np.cross(arms, normals), normals], axis=1)
-    if covariance.shape == (7, 7):
-        # Growing by ln s moves a point by its arm.
-        rows = np.column_stack([rows, np.einsum("ij,ij->i", arms, normals)])
+    rows = plane_rows(core - about, normals, with_scale=covariance.shape == (7, 7))
     variance = np.einsum("ki,ij,kj->k", rows, covariance, rows)
     sigma: Values = np.sqrt(np.clip(variance, 0.0, None))
     return sigma

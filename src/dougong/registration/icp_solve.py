@@ -47,6 +47,19 @@ def moved_by(T: Transform, step: NDArray[np.float64], centre: NDArray[np.float64
     return result
 
 
+def plane_rows(arms: Points, normals: Points, *, with_scale: bool = False) -> NDArray[np.float64]:
+    """Return d(residual along the normal) / d(omega, v[, ln s]), (n, 6) or (n, 7).
+
+    n . (omega x arm + v) = (arm x n) . omega + n . v, and growing by ln s moves a point by its
+    arm; `arms` (n, 3) are the points about the centre of `moved_by`'s motion.
+    """
+    parts = [np.cross(arms, normals), normals]
+    if with_scale:
+        parts.append(np.einsum("ij,ij->i", arms, normals)[:, None])
+    rows: NDArray[np.float64] = np.concatenate(parts, axis=1)
+    return rows
+
+
 def levelled(T: Transform, centre: NDArray[np.float64]) -> Transform:
     """Return `T` with its rotation replaced by its turn about the vertical.
 

@@ -16,6 +16,7 @@ from dougong.registration.icp_solve import (
     gravity_prior,
     levelled,
     moved_by,
+    plane_rows,
     robust_weights,
     robust_widening,
     weighted_median,
@@ -152,9 +153,7 @@ def _paired(level: Level, T: Transform, icp: Icp) -> _Fitted | None:
     scale = max(1.4826 * weighted_median(distance, pairs.weights), floor)
     weights = pairs.weights * robust_weights(distance, scale, icp.robust)
     centre, length = centre_and_length(pairs, weights)
-    arms = pairs.points - centre
-    growth = np.einsum("ij,ij->i", arms, pairs.normals)
-    rows = np.column_stack([np.cross(arms, pairs.normals), pairs.normals, growth])
+    rows = plane_rows(pairs.points - centre, pairs.normals, with_scale=True)
     return _Fitted(
         pairs=pairs, weights=weights, rows=rows, centre=centre, length=length, scale_m=scale
     )

@@ -1,0 +1,228 @@
+"""``dougong filter``: one file through a recipe or one filter, with its books beside it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dougong.cloud import Cloud
+from dougong.errors import InputError
+from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
+from dougong.filters.selection import Reason
+from dougong.formats import (
+    describe,
+    faults_of,
+    read,
+    write,
+)
+from dougong.params import Parameters
+from dougong.pipeline.marking import GROUND_CLASS, marked, with_classes
+from dougong.pipeline.memory import Room, refuse_too_large
+from dougong.pipeline.outputs import refuse_output, watched, write_json
+from dougong.pipeline.progress import Progress
+from dougong.pipeline.provenance import Clock, peak_memory_bytes, sha256, software
+from dougong.pipeline.recipes import (
+    LidarRecipe,
+    PhotogrammetryRecipe,
+    Recipe,
+    filter_cloud,
+    lidar_after_grid,
+)
+from dougong.pipeline.registrations import finite
+from dougong.pipeline.removed import detail_counts
+from dougong.pipeline.settings import parse_overrides, updated
+from dougong.pipeline.single import filter_name, filter_single, single_fields, single_parameters
+from dougong.pipeline.steps import Filtered
+from dougong.pipeline.tiled import (
+    FilteredOnTiles,
+    GridFirst,
+    filter_chunks,
+    is_too_large,
+    stations_of,
+)
+from dougong.typing import Kind
+
+Document = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilterJob:
+    """A sensor's recipe, or one filter alone."""
+
+    kind: Kind | None
+    only: str | None
+    params: Parameters
+
+    def run(self, cloud: Cloud, progress: Progress) -> Filtered:
+        """Filter `cloud`."""
+        if self.only is not None:
+            return filter_single(cloud, self.only, self.params, progress)
+        assert self.kind is not None
+        recipe = Recipe().model_copy(update={self.kind: self.params})
+        return filter_cloud(cloud, self.kind, recipe, progress)
+
+    def grid_first(self) -> GridFirst | None:
+        """Return the job as tiles can do it, or None where it does not begin with a voxel grid."""
+        if isinstance(self.params, OctreeVoxelGrid):
+            return GridFirst(grid=self.params, after=lambda _: None)
+        if self.only is None and isinstance(self.params, LidarRecipe):
+            recipe = self.params
+            return GridFirst(
+                grid=recipe.octree_voxel_grid, after=lambda bench: lidar_after_grid(bench, recipe)
+            )
+        return None
+
+
+def filter_job(kind: Kind | None, only: str | None, settings: Sequence[str]) -> FilterJob:
+    """Return what ``dougong filter`` was asked for.
+
+    Raises
+    ------
+    InputError
+        Neither a kind nor a filter is named, or a setting is wrong.
+    """
+    if only is not None:
+        name = filter_name(only)
+        values = parse_overrides(settings, {name: single_fields(name)})
+        return FilterJob(kind=kind, only=name, params=single_parameters(name, values.get(name, {})))
+    if kind is None:
+        msg = (
+            "--kind is missing: say which sensor made the cloud, --kind lidar or "
+            "--kind photogrammetry, or name one filter with --only."
+        )
+        raise InputError(msg)
+    recipe: LidarRecipe | PhotogrammetryRecipe = getattr(Recipe(), kind)
+    fields = {name: list(type(getattr(recipe, name)).model_fields) for name in _filters_of(recipe)}
+    changes = {
+        name: updated(getattr(recipe, name), values, name)
+        for name, values in parse_overrides(settings, fields).items()
+    }
+    return FilterJob(kind=kind, only=None, params=recipe.model_copy(update=changes))
+
+
+def _filters_of(recipe: Parameters) -> list[str]:
+    return list(type(recipe).model_fields)
+
+
+def filter_file(
+    input: Path,
+    output: Path,
+    *,
+    job: FilterJob,
+    mark: bool,
+    overwrite: bool,
+    memory_bytes: int | None,
+    progress: Progress,
+) -> Document:
+    """Filter one file into another and write its books beside it (``OUTPUT.json``).
+
+    Raises
+    ------
+    InputError
+        An output exists, or the job needs more memory than it may use.
+    FormatError, OutputError
+        The input cannot be read, the output not written (a full disk).
+    """
+    books = output.with_name(output.name + ".json")
+    refuse_output(input, output, [output, books], overwrite)
+    clock = Clock()
+    progress.stage(f"reading {input.name}")
+    with clock.measure("read"):
+        digest = sha256(input)
+    room, tiled = Room.of(memory_bytes), job.grid_first()
+    if tiled is not None and not mark and is_too_large(input, room, 0):
+        progress.note(f"{input.name} is larger than memory: its voxel grid runs on tiles")
+        with clock.measure("filter"):
+            found = _filtered_on_tiles(input, tiled, room, output.parent, progress)
+        filtered, noticed, result = found.filtered, found.notes, found.filtered.cloud
+    else:
+        refuse_too_large([input], memory_bytes)
+        with clock.measure("read"):
+            cloud = read(input)
+            noticed = (*cloud.notes, *faults_of(cloud))
+        with clock.measure("filter"):
+            filtered = job.run(cloud, progress)
+        result = _chosen(job, cloud, filtered, mark)
+    progress.stage(f"writing {output.name}")
+    with watched(output, books):
+        with clock.measure("write"):
+            written = write(result, output, overwrite=overwrite)
+        notes = [*noticed, *filtered.notes, *written.notes]
+        document = {
+            "input": {"path": str(input), "sha256": digest, "points": len(filtered.codes)},
+            "output": str(output),
+            **_filter_document(job, filtered, result, mark),
+            "notes": notes,
+            "seconds": {**clock.seconds, "total": clock.total()},
+            "peak_memory_bytes": peak_memory_bytes(),
+            "software": software(),
+        }
+        cleaned: Document = finite(document)
+        write_json(books, cleaned)
+    return cleaned
+
+
+def _filter_document(job: FilterJob, filtered: Filtered, result: Cloud, mark: bool) -> Document:
+    """Return what the books say of the filter: counts per stage, reasons, parameters."""
+    points_in, points_kept = len(filtered.codes), len(filtered.cloud)
+    return {
+        "kind": job.kind,
+        "only": job.only,
+        "is_marked": mark,
+        "points_in": points_in,
+        "points_kept": points_kept,
+        "points_written": len(result),
+        "reduction": 1.0 - points_kept / points_in,
+        "stages": [
+            {
+                "name": stage.name,
+                "points_in": stage.points_in,
+                "points_out": stage.points_out,
+                "reduction": stage.reduction,
+                "seconds": stage.seconds,
+            }
+            for stage in filtered.stages
+        ],
+        "reasons": reason_table(filtered),
+        "ground_points": int(filtered.is_ground.sum()),
+        "parameters": job.params.model_dump(mode="json"),
+    }
+
+
+def _filtered_on_tiles(
+    input: Path, job: GridFirst, room: Room, scratch: Path, progress: Progress
+) -> FilteredOnTiles:
+    (chunks,) = stations_of(input, split=False)
+    return filter_chunks(
+        chunks,
+        job,
+        points=describe(input).points,
+        room=room,
+        waiting=0,
+        scratch=scratch,
+        progress=progress,
+    )
+
+
+def reason_table(filtered: Filtered) -> dict[str, dict[str, Any]]:
+    """Return per reason its code in ``dougong_reason`` and the points it took, in detail too."""
+    table: dict[str, dict[str, Any]] = {}
+    for reason in Reason:
+        chosen = filtered.codes == reason
+        if not chosen.any():
+            continue
+        row: dict[str, Any] = {"code": int(reason), "points": int(chosen.sum())}
+        if reason == Reason.CURVATURE_WEIGHTED:
+            row["details"] = detail_counts(filtered.codes, filtered.details)
+        table[reason.name.lower()] = row
+    return table
+
+
+def _chosen(job: FilterJob, cloud: Cloud, filtered: Filtered, mark: bool) -> Cloud:
+    """Return what is written: the kept points, or all points with their marks."""
+    if mark:
+        return marked(cloud, filtered.codes, filtered.ground_class, filtered.details)
+    if job.only == "cloth_simulation" and getattr(job.params, "keep", "") == "all":
+        # Alone, the cloth takes nothing out: its answer is the class.
+        return with_classes(filtered.cloud, [(filtered.is_ground, GROUND_CLASS)])
+    return filtered.cloud

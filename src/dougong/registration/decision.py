@@ -1,0 +1,213 @@
+"""From starting poses to one pose with a verdict: refine, compare, judge (METHOD.md 2.3 and 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from dougong.registration import hypotheses as ranking
+from dougong.registration.control import Adjusted, Control, adjust, weigh_control
+from dougong.registration.covariance import displacement95
+from dougong.registration.evidence import Court, hear, summon
+from dougong.registration.handedness import LEFT_SENTENCE, handedness
+from dougong.registration.icp import Icp, build_levels, refine
+from dougong.registration.laps import Laps
+from dougong.registration.overlap import apply
+from dougong.registration.prepare import Prepared
+from dougong.registration.result import FineResult, Hypothesis
+from dougong.registration.rivals import is_same, middle_of
+from dougong.registration.settings import Register
+from dougong.registration.verdict import Ruling, rule, status_of
+from dougong.typing import Transform
+
+_LISTED = 12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Found:
+    """The verdict on a pair, in local frames."""
+
+    status: Literal["ok", "ambiguous", "failed"]
+    reason: str
+    T: Transform | None
+    fine: FineResult | None
+    probability: float
+    hypotheses: tuple[Hypothesis, ...]
+    margin: float
+    ruling: Ruling | None
+    adjusted: Adjusted | None = None
+    """With the control points; None: there are none, or they changed nothing."""
+
+
+def decide(
+    source: Prepared,
+    target: Prepared,
+    starts: Sequence[Hypothesis],
+    params: Register,
+    clock: Laps | None = None,
+    control: Control | None = None,
+) -> Found:
+    """Refine, compare and judge the starting poses; local frames."""
+    clock = clock or Laps()
+    if not starts:
+        return refused(
+            "the coarse search found no pose at which the two clouds have anything in common."
+        )
+    court = summon(source, target)
+    quick = _quick(_icp(params), source, target)
+    levels = build_levels(source, target, quick)
+    hint, reach = params.yaw_hint_deg, params.plan.yaw_hint_range_deg
+    ruling = rule(
+        court,
+        levels,
+        [h.T_target_source for h in starts],
+        quick,
+        params.verdict,
+        lambda T: (
+            (hint is None or _is_near_yaw(T, hint, reach))
+            and (control is None or control.allows(T))
+        ),
+    )
+    clock.lap("proof")
+    fine, adjusted = _refined(source, target, ruling, params, control)
+    T = ruling.winner.T if fine is None else fine.T_target_source
+    clock.lap("fine")
+    status, reason = _judged(court, ruling, fine, params)
+    if status == "ok":
+        hand = handedness(court, levels, ruling.winner, quick, params.verdict)
+        if hand == "left":
+            return refused(LEFT_SENTENCE)
+        reason += " Its mirror image fits as well." if hand == "unknown" else ""
+        clock.lap("mirror check")
+    status, reason = weigh_control(status, reason, adjusted)
+    listed = _listed(ruling, T, starts, source, target)
+    return Found(
+        status=status,
+        reason=reason,
+        T=None if status == "failed" else T,
+        fine=fine,
+        probability=0.0 if status == "failed" else ruling.probability,
+        hypotheses=listed,
+        margin=_margin(listed),
+        ruling=ruling,
+        adjusted=adjusted,
+    )
+
+
+def _icp(params: Register) -> Icp:
+    method = {} if params.fine == "none" else {"method": params.fine}
+    return params.icp.model_copy(update={"dof": 4 if params.dof == 4 else 6, **method})
+
+
+def _refined(
+    source: Prepared, target: Prepared, ruling: Ruling, params: Register, control: Control | None
+) -> tuple[FineResult | None, Adjusted | None]:
+    """Return the exact fit at the winning pose, adjusted with the control points if there are any.
+
+    None, None: what the proof has refused needs no exact pose.
+    """
+    if params.fine == "none" or status_of(ruling, None, params.verdict)[0] == "failed":
+        return None, None
+    icp = _icp(params)
+    fine = refine(source, target, ruling.winner.T, icp)
+    adjusted = None if control is None else adjust(fine, control, icp.dof)
+    return (fine if adjusted is None else adjusted.fine), adjusted
+
+
+def refused(reason: str) -> Found:
+    """Return the answer when no pose is even listed."""
+    return Found(
+        status="failed",
+        reason=reason,
+        T=None,
+        fine=None,
+        probability=0.0,
+        hypotheses=(),
+        margin=0.0,
+        ruling=None,
+    )
+
+
+def _quick(icp: Icp, source: Prepared, target: Prepared) -> Icp:
+    """Return settings for bringing every hypothesis to its place: wide bounds, few points."""
+    spacing = max(source.spacing_m, target.spacing_m)
+    return icp.model_copy(
+        update={
+            "method": "point-to-plane",
+            "levels": 3,
+            "first_distance_m": max(1.5, 12.0 * spacing),
+            "last_distance_m": max(0.25, 3.0 * spacing),
+            "points_per_level": min(4000, icp.points_per_level),
+            "tolerance_m": 5e-4,
+            "max_iterations": 20,
+        }
+    )
+
+
+def _judged(
+    court: Court, ruling: Ruling, fine: FineResult | None, params: Register
+) -> tuple[Literal["ok", "ambiguous", "failed"], str]:
+    status, reason = status_of(ruling, fine, params.verdict)
+    if fine is None or status == "failed":
+        return status, reason
+    final = hear(court, fine.T_target_source)
+    if not is_same(final.T, ruling.winner.T, middle_of(court.source.points)):
+        return "ambiguous", (
+            "the fine fit left the pose that was judged best: the surface near it holds it "
+            "too weakly. Control points or more overlap would decide."
+        )
+    if status == "ok" and fine.covariance is not None:
+        explained = final.is_explained[: len(court.source.points)]
+        shared = apply(final.T, court.source.points[explained])
+        spread = displacement95(
+            fine.covariance, fine.covariance_about, shared, fine.covariance_blocks
+        )
+        limit = params.verdict.most_spread_m
+        if spread > limit:
+            return "ambiguous", (
+                f"the parts of the shared surface disagree about the pose by {spread:.2g} m "
+                f"(95 %; at most {limit:.2g} m expected): it is held too weakly, or one cloud is "
+                "bent. Control points or more overlap would decide."
+            )
+        reason += (
+            f" The parts of the shared surface agree about it to {1e3 * spread:.0f} mm (95 %)."
+        )
+    return status, reason
+
+
+def _is_near_yaw(T: Transform, hint_deg: float, reach_deg: float) -> bool:
+    yaw = np.degrees(np.arctan2(T[1, 0], T[0, 0]))
+    return bool(abs((yaw - hint_deg + 180.0) % 360.0 - 180.0) <= reach_deg)
+
+
+def _listed(
+    ruling: Ruling,
+    T: Transform,
+    starts: Sequence[Hypothesis],
+    source: Prepared,
+    target: Prepared,
+) -> tuple[Hypothesis, ...]:
+    """Return the winner, then the other refined poses and coarse ones, by score."""
+    method = starts[0].method
+    best = Hypothesis(T_target_source=T, score=ranking.score(T, source, target), method=method)
+    refined = [
+        Hypothesis(
+            T_target_source=c.T, score=ranking.score(c.T, source, target), method=f"{method}, rival"
+        )
+        for c in (*ruling.undecided, *ruling.beaten)
+    ]
+    others = ranking.dedupe([*refined, *starts], source)
+    middle = middle_of(source.xyz)
+    others = [h for h in others if not is_same(h.T_target_source, T, middle)]
+    return (best, *others[: _LISTED - 1])
+
+
+def _margin(listed: Sequence[Hypothesis]) -> float:
+    """Return 1 - s2 / s1, at least 0; 1 when there is one pose."""
+    if len(listed) < 2:
+        return 1.0
+    best = max(listed[0].score, 1e-12)
+    return max(0.0, 1.0 - max(h.score for h in listed[1:]) / best)

@@ -1,0 +1,47 @@
+"""The poses a registration starts from: of the chosen coarse method, and those it is told."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dougong.cloud import Frame
+from dougong.registration import hypotheses as ranking
+from dougong.registration.congruent_sets import four_pcs
+from dougong.registration.picked_pairs import PairFit, starts_of
+from dougong.registration.plan_search import plan_search
+from dougong.registration.prepare import Prepared
+from dougong.registration.principal_axes import improved_pca, traditional_pca
+from dougong.registration.result import Hypothesis
+from dougong.registration.sample_consensus import sac_ia
+from dougong.registration.settings import Register
+from dougong.typing import Transform
+
+
+def picked_poses(fit: PairFit, source: Prepared, target: Prepared) -> list[Hypothesis]:
+    """Return the poses that picked pairs propose, scored."""
+    return [heard(T, "pairs", source, target) for T in starts_of(fit)]
+
+
+def heard(T: Transform, method: str, source: Prepared, target: Prepared) -> Hypothesis:
+    """Return a pose that no search found, scored as theirs are."""
+    return Hypothesis(T_target_source=T, score=ranking.score(T, source, target), method=method)
+
+
+def coarse_poses(
+    source: Prepared, target: Prepared, source_frame: Frame, target_frame: Frame, params: Register
+) -> list[Hypothesis]:
+    """Return the starting poses of the chosen method, best first, in local frames."""
+    if params.coarse == "none":
+        T = np.eye(4)
+        T[:3, 3] = source_frame.origin - target_frame.origin
+        return [heard(T, "none", source, target)]
+    if params.coarse == "improved-pca":
+        return list(improved_pca(source, target))
+    if params.coarse == "pca":
+        return list(traditional_pca(source, target))
+    if params.coarse == "sac-ia":
+        return sac_ia(source, target, params.sac_ia)
+    if params.coarse == "4pcs":
+        return four_pcs(source, target, params.congruent_sets)
+    plan = params.plan.model_copy(update={"yaw_hint_deg": params.yaw_hint_deg})
+    return plan_search(source, target, plan)
