@@ -19,6 +19,7 @@ from dougong.registration.overlap import apply
 from dougong.registration.prepare import Prepared
 from dougong.registration.result import FineResult, Hypothesis
 from dougong.registration.rivals import is_same, middle_of
+from dougong.registration.roof_sides import height_left_open, weigh_height
 from dougong.registration.settings import Register
 from dougong.registration.verdict import Ruling, rule, status_of
 from dougong.typing import Transform
@@ -76,6 +77,9 @@ def decide(
     T = ruling.winner.T if fine is None else fine.T_target_source
     clock.lap("fine")
     status, reason = _judged(court, ruling, fine, params)
+    if status == "ok" and fine is not None and adjusted is None:
+        left_open = height_left_open(court, source, target, T)
+        status, reason = weigh_height(reason, left_open)
     if status == "ok":
         hand = handedness(court, levels, ruling.winner, quick, params.verdict)
         if hand == "left":

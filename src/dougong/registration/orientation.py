@@ -45,6 +45,8 @@ class Sides:
     may_be_underside: Mask
     """(n,) a roof or floor overhead, its side not sure, open beneath (or nothing is known of what
     lies beneath)."""
+    is_unknown: Mask
+    """(n,) a roof or floor overhead, its side not sure, whatever lies beneath."""
 
 
 def sides(
@@ -88,7 +90,12 @@ def sides(
         sign[is_known] = np.where(cosine[is_known] < 0.0, -1.0, 1.0)
     is_unsure_roof = (np.abs(rise) > _UPWARD) & ~is_sure & ~is_low
     may_be = is_unsure_roof & (_is_open_beneath(xyz @ up, xyz) | np.isnan(height))
-    return Sides(normals=normals * sign[:, None], is_sure=is_sure, may_be_underside=may_be)
+    return Sides(
+        normals=normals * sign[:, None],
+        is_sure=is_sure,
+        may_be_underside=may_be,
+        is_unknown=is_unsure_roof,
+    )
 
 
 def sights(cloud: Cloud, chosen: Index) -> Points | None:

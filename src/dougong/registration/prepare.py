@@ -71,6 +71,8 @@ class Prepared:
     kind: Kind
     may_be_underside: Mask | bool = False
     """(n,), or one for all: a roof overhead of which nobody knows the side, see `orientation`."""
+    side_is_unknown: Mask | bool = False
+    """(n,), or one for all: the same, and also where nothing tells that it may be an underside."""
     has_ground: bool = True
     levelling: Levelling = field(default_factory=Levelling)
     """What the walls say about z; `levelling.up` is trusted only where `is_relevelled`."""
@@ -136,6 +138,7 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
         normals=seen.normals[stays],
         normal_is_oriented=seen.is_sure[stays],
         may_be_underside=seen.may_be_underside[stays],
+        side_is_unknown=seen.is_unknown[stays],
         planarity=plane.planarity[stays],
         is_ground=ground.is_ground[stays],
         height_above_ground=ground.height[stays],

@@ -1,0 +1,52 @@
+"""A roof seen from one side by the scanner and from the other by the drone."""
+
+import numpy as np
+
+from dougong.registration import Register, register
+from registration_sites import (
+    L_PLAN,
+    SETTINGS,
+    _inside,
+    as_cloud,
+    motion,
+    moved,
+    pose_error,
+    rectangle,
+    site,
+)
+
+THICKNESS_M = 0.25
+TRUTH = motion(37.0, (5.0, -3.0, 1.5))
+
+
+def with_soffit(seed):
+    """Return a scan with the soffit over a gallery inside the walls, its floor out of sight."""
+    rng = np.random.default_rng([seed, 1])
+    soffit = rectangle(rng, [-10, -6, 5.0 - THICKNESS_M], [22, 0, 0], [0, 15, 0], 40.0)
+    is_gallery = ~_inside(soffit[:, :2] + (0.8, 0.0), 0.8 * np.asarray(L_PLAN, float))
+    soffit = soffit[_inside(soffit[:, :2], L_PLAN) & is_gallery]
+    return np.vstack([site("lidar", seed), soffit + rng.normal(0, 0.003, soffit.shape)])
+
+
+def flown(seed, *, has_ground):
+    points = site("photogrammetry", seed + 100)
+    return moved(points if has_ground else points[points[:, 2] > 0.3], TRUTH)
+
+
+def registered(source, target):
+    source, target = as_cloud(source), as_cloud(target)
+    found = register(source, target, Register(prepare=SETTINGS))
+    return found, pose_error(found.matrix, TRUTH) if found.matrix is not None else None
+
+
+def test_a_soffit_is_not_taken_for_the_roof_above_it():
+    """Without ground in the flight only the roof speaks of the height, and it may be either."""
+    found, _ = registered(with_soffit(0), flown(0, has_ground=False))
+    assert found.status == "ambiguous"
+    assert "from above or from below" in found.reason
+
+
+def test_ground_in_both_clouds_holds_the_height():
+    found, error = registered(with_soffit(0), flown(0, has_ground=True))
+    assert found.status == "ok"
+    assert error[2] < 0.03
