@@ -14,11 +14,9 @@ from dougong.pipeline.control import control_of, quality_document, read_control
 from dougong.pipeline.pairs import HEADER
 from dougong.registration import Register, register
 from dougong.registration.checks import check_error, level_of, reaches
-from dougong.registration.control import (
-    ControlPoints,
-    adjust,
-    local_control,
-)
+from dougong.registration.control import adjust, local_control
+from dougong.registration.control_solve import ControlPoints
+from dougong.registration.covariance import displacement95
 from dougong.registration.overlap import apply
 from dougong.registration.result import FineResult
 from registration_sites import SETTINGS, polygon, site
@@ -390,3 +388,24 @@ def test_a_level_without_check_points_is_refused(tmp_path, capsys):
     project.write_text(cloud + '[quality]\nrequired_level = "LOA20"\n')
     assert call(["run", str(project), "--out", str(tmp_path / "out")]) == 2
     assert "no check points" in capsys.readouterr().err
+
+
+def test_the_part_of_the_covariance_that_control_points_bring_is_known():
+    T = motion()
+    control, _, _ = local(points(T, sigma=0.004), T)
+    pose = control.T_target_source
+    by_points = adjust(fit(pose, 0.5), control, 6).fine
+    np.testing.assert_allclose(by_points.covariance_of_control, by_points.covariance, rtol=1e-2)
+    by_clouds = adjust(fit(pose, 1e-5), control, 6).fine
+    assert np.trace(by_clouds.covariance_of_control) < 1e-4 * np.trace(by_clouds.covariance)
+
+
+def test_few_blocks_say_nothing_of_what_control_points_fix():
+    covariance = np.diag([2e-4**2] * 3 + [0.003**2] * 3)
+    surface = np.random.default_rng(0).uniform(-20, 20, (300, 3))
+    known = displacement95(covariance, np.zeros(3), surface, 14, covariance)
+    normal = displacement95(covariance, np.zeros(3), surface, 1_000_000)
+    assert known == pytest.approx(normal, rel=0.05)
+    # Half from each: between the two, by their variances.
+    both = displacement95(2 * covariance, np.zeros(3), surface, 1_000_000, covariance)
+    assert both == pytest.approx(2**0.5 * normal, rel=0.05)

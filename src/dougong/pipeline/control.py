@@ -12,7 +12,7 @@ from dougong.pipeline.pairs import COORDINATES, HEADER, coordinates_in, csv_rows
 from dougong.pipeline.project import Project
 from dougong.pipeline.provenance import sha256
 from dougong.registration.checks import reaches
-from dougong.registration.control import ControlPoints
+from dougong.registration.control_solve import ControlPoints
 
 _ROLES = ("control", "check")
 

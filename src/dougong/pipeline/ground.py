@@ -24,7 +24,7 @@ from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.formats import units_of
 from dougong.formats.projection import GridScale, grid_scale, is_in_use, is_same_plan
-from dougong.registration.control import ControlPoints
+from dougong.registration.control_solve import ControlPoints
 from dougong.registration.picked_pairs import PickedPairs
 from dougong.registration.result import FineResult, Hypothesis, Registration
 from dougong.typing import Points, Transform, Values

@@ -13,7 +13,7 @@ from dougong.pipeline.axes import mirrored_axes, upside_down
 from dougong.pipeline.ground import pair_on_ground, to_file
 from dougong.registration import Register
 from dougong.registration import register as search
-from dougong.registration.control import ControlPoints
+from dougong.registration.control_solve import ControlPoints
 from dougong.registration.file_coordinates import unit_of
 from dougong.registration.picked_pairs import PickedPairs
 from dougong.registration.result import Registration

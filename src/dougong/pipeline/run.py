@@ -39,7 +39,7 @@ from dougong.pipeline.registrations import finite, to_document
 from dougong.pipeline.removed import detail_totals
 from dougong.pipeline.store import Store
 from dougong.registration import Register
-from dougong.registration.control import ControlPoints
+from dougong.registration.control_solve import ControlPoints
 from dougong.registration.result import Registration
 from dougong.typing import Transform
 

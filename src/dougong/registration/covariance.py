@@ -155,19 +155,35 @@ def _axis(vector: NDArray[np.float64]) -> str:
 
 
 def displacement95(
-    covariance: NDArray[np.float64], centre: NDArray[np.float64], points: Points, blocks: int
+    covariance: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    points: Points,
+    blocks: int,
+    of_control: NDArray[np.float64] | None = None,
 ) -> float:
     """Return the TRE95 that 95 % of the poses stay below which the data allow, metres.
 
-    Poses are drawn from the jackknife's own distribution, Student's t with `blocks` - 1 degrees
-    of freedom (`covariance` without its widening); TRE95 is the 95 % displacement of `points`
-    (n, 3). The draws are the same for every call, so that the answer is a function of the data.
+    What the blocks of surface say is drawn from the jackknife's own distribution, Student's t with
+    `blocks` - 1 degrees of freedom (`covariance` without its widening). `of_control` (6, 6), the
+    part of `covariance` that comes from control points of known sigma, is drawn as normal and is
+    not widened to begin with. TRE95 is the 95 % displacement of `points` (n, 3). The draws are the
+    same for every call, so that the answer is a function of the data.
     """
     rng = np.random.default_rng(0)
-    values, vectors = np.linalg.eigh(covariance * (blocks - 8) / (blocks - 1))
-    draws = rng.normal(size=(_DRAWS, 6)) * np.sqrt(np.clip(values, 0.0, None)) @ vectors.T
+    known = np.zeros((6, 6)) if of_control is None else of_control
+    draws = _drawn(rng, (covariance - known) * (blocks - 8) / (blocks - 1))
     draws /= np.sqrt(rng.chisquare(blocks - 1, (_DRAWS, 1)) / (blocks - 1))
+    if of_control is not None:
+        draws += _drawn(rng, known)
     arms = (points - centre)[:: max(1, len(points) // _DRAWN_POINTS)]
     motion = np.cross(draws[:, None, :3], arms[None]) + draws[:, None, 3:]
     tre95 = np.quantile(np.linalg.norm(motion, axis=2), 0.95, axis=1)
     return float(np.quantile(tre95, 0.95))
+
+
+def _drawn(rng: np.random.Generator, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return normal draws (k, 6) of a covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    normal = rng.normal(size=(_DRAWS, len(covariance)))
+    drawn: NDArray[np.float64] = normal * np.sqrt(np.clip(values, 0.0, None)) @ vectors.T
+    return drawn

@@ -167,7 +167,11 @@ def _judged(
         explained = final.is_explained[: len(court.source.points)]
         shared = apply(final.T, court.source.points[explained])
         spread = displacement95(
-            fine.covariance, fine.covariance_about, shared, fine.covariance_blocks
+            fine.covariance,
+            fine.covariance_about,
+            shared,
+            fine.covariance_blocks,
+            fine.covariance_of_control,
         )
         limit = params.verdict.most_spread_m
         if spread > limit:

@@ -47,6 +47,19 @@ def moved_by(T: Transform, step: NDArray[np.float64], centre: NDArray[np.float64
     return result
 
 
+def grown_by(T: Transform, step: NDArray[np.float64], centre: NDArray[np.float64]) -> Transform:
+    """Return the similarity `T` followed by x' = c + s Exp(omega)(x - c) + v.
+
+    step = (omega, v, ln s), (7,).
+    """
+    growth, turn = float(np.exp(step[6])), rotation_of(step[:3])
+    scale = growth * float(np.cbrt(np.linalg.det(T[:3, :3])))
+    result = np.eye(4)
+    result[:3, :3] = scale * orthonormal(turn @ T[:3, :3])
+    result[:3, 3] = growth * (turn @ (T[:3, 3] - centre)) + centre + step[3:6]
+    return result
+
+
 def plane_rows(arms: Points, normals: Points, *, with_scale: bool = False) -> NDArray[np.float64]:
     """Return d(residual along the normal) / d(omega, v[, ln s]), (n, 6) or (n, 7).
 

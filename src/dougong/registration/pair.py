@@ -7,7 +7,8 @@ from typing import Literal
 
 from dougong.cloud import Cloud, Frame
 from dougong.registration.checks import checks_document
-from dougong.registration.control import Control, ControlPoints, local_control
+from dougong.registration.control import Control, local_control
+from dougong.registration.control_solve import ControlPoints
 from dougong.registration.decision import decide, refused
 from dougong.registration.file_coordinates import in_file_coordinates, unit_of
 from dougong.registration.free_scale import search_scale

@@ -52,6 +52,8 @@ class FineResult:
     block jackknife; None: unknown."""
     covariance_about: NDArray[np.float64]
     """(3,), local target coordinates."""
+    covariance_of_control: NDArray[np.float64] | None = None
+    """(6, 6), the part of `covariance` that the sigmas of control points bring; None: no points."""
     covariance_blocks: int = 0
     """Independent blocks of surface behind `covariance`; 0 where it is None."""
     unobservable: tuple[Mapping[str, Any], ...] = ()
