@@ -7,7 +7,7 @@ from dougong.registration import Icp, Register, register
 from dougong.registration.free_scale import scaled, search_scale
 from dougong.registration.icp_solve import moved_by
 from dougong.registration.prepare import Prepare, prepare
-from dougong.registration.similarity_fit import _moved, fit_similarity
+from dougong.registration.similarity_fit import fit_similarity, grown
 from registration_sites import as_cloud, motion, moved, rectangle, site
 
 THIN = Prepare(min_spacing_m=0.25)
@@ -30,7 +30,7 @@ def test_a_step_scales_the_free_cloud_only(side):
     seen = moved(point, moved_by(T, np.zeros(6), centre))
     turn = moved_by(np.eye(4), np.concatenate([step[:3], np.zeros(3)]), np.zeros(3))[:3, :3]
     expected = centre + np.exp(0.02) * (seen - centre) @ turn.T + step[3:6]
-    result, factor = _moved(T, 1.0, step, centre, side)
+    result, factor = grown(T, 1.0, step, centre, side)
     # A free target shrinks instead of the source growing.
     is_source = side == "source"
     found = moved(factor * point, result) if is_source else moved(point, result) / factor

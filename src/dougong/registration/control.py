@@ -7,7 +7,7 @@ left out. Check points touch nothing: they say how right the result is (METHOD.m
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from dougong.cloud import Cloud
 from dougong.errors import InputError
-from dougong.registration.control_solve import ControlPoints, information_of, joint, miss, own_pose
+from dougong.registration.control_solve import (
+    RIGID,
+    ControlPoints,
+    information_of,
+    joint,
+    miss,
+    own_pose,
+)
 from dougong.registration.icp_solve import FREE
 from dougong.registration.result import FineResult, Status
 from dougong.typing import Mask, Points, Transform
@@ -25,8 +32,8 @@ _NEAR_M = 0.5
 """A pose of the search may lie so far from the control points and still be theirs: it is not fine
 yet."""
 _SIGMAS = 4.0
-_DISAGREE_P = 1e-3
-_DISAGREE_M = 0.05
+DISAGREE_P = 1e-3
+DISAGREE_M = 0.05
 """What METHOD.md 5 calls correct: two answers that differ by less may both be."""
 
 
@@ -64,8 +71,12 @@ class Adjusted:
     """Chance of such a miss if the clouds' covariance and the sigmas were true."""
 
 
-def local_control(control: ControlPoints, source: Cloud, target: Cloud) -> Control:
+def local_control(
+    control: ControlPoints, source: Cloud, target: Cloud, free: Sequence[int] = RIGID
+) -> Control:
     """Bring the points into local metres, and find a bad one among the control points.
+
+    `free` says which of (omega, v, ln s) their own pose may have.
 
     Raises
     ------
@@ -80,7 +91,7 @@ def local_control(control: ControlPoints, source: Cloud, target: Cloud) -> Contr
     for side, cloud in (("source", source), ("target", target)):
         _refuse_far(getattr(points, side), cloud, side, control)
     used = ~points.is_check
-    T, used = own_pose(points, used)
+    T, used = own_pose(points, used, free)
     return Control(points=points, used=used, T_target_source=T)
 
 
@@ -139,7 +150,7 @@ def _is_held(item: Mapping[str, Any], covariance: NDArray[np.float64]) -> bool:
     """
     vector = np.asarray(item["vector"], dtype=np.float64)
     length = float(vector @ vector)
-    return bool(np.sqrt(vector @ covariance @ vector) / length < _DISAGREE_M)
+    return bool(np.sqrt(vector @ covariance @ vector) / length < DISAGREE_M)
 
 
 def weigh_control(status: Status, reason: str, adjusted: Adjusted | None) -> tuple[Status, str]:
@@ -148,7 +159,7 @@ def weigh_control(status: Status, reason: str, adjusted: Adjusted | None) -> tup
         return status, reason
     count = int(adjusted.used.sum())
     told = f"{count} control point{'s' if count != 1 else ''}"
-    if adjusted.p_value < _DISAGREE_P and adjusted.disagreement_m > _DISAGREE_M:
+    if adjusted.p_value < DISAGREE_P and adjusted.disagreement_m > DISAGREE_M:
         return "ambiguous", (
             f"the clouds and the {told} disagree by {adjusted.disagreement_m:.2g} m (root mean "
             f"square), more than both declare (p = {max(adjusted.p_value, 1e-9):.1g}): a point is "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -45,8 +45,45 @@ def jackknife(
 ) -> tuple[NDArray[np.float64] | None, int]:
     """Return the (6, 6) covariance of (omega, v) about `centre`, and its number of blocks.
 
-    Blocks are left out one by one.
+    See `leave_blocks_out`.
+    """
+    arms = pairs.points - centre
 
+    def equations(block: Index, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return normal_equations(arms, pairs.normals, pairs.residuals, weights, block, count)
+
+    unit = np.array([length_m] * 3 + [1.0] * 3)
+    return leave_blocks_out(
+        pairs.points, equations, lambda H, g: solve(H, g, dof, length_m), unit, block_m
+    )
+
+
+def leave_blocks_out(
+    points: Points,
+    equations: Callable[[Index, int], tuple[NDArray[np.float64], NDArray[np.float64]]],
+    solved: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
+    unit: NDArray[np.float64],
+    block_m: float,
+) -> tuple[NDArray[np.float64] | None, int]:
+    """Return the covariance (k, k) of a fit's k unknowns, and the number of blocks behind it.
+
+    Blocks of the surface are left out one by one.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3)
+        Of the correspondences.
+    equations : callable
+        Normal equations H (b, k, k) and g (b, k) of each of b blocks, from the block (n,) of each
+        point.
+    solved : callable
+        The step (k,) that H and g lead to.
+    unit : ndarray, shape (k,)
+        What turns each unknown into metres of motion.
+    block_m : float
+
+    Notes
+    -----
     Errors of neighbouring points, and of a bending cloud, go together: what a whole block pulls
     is one observation. Blocks of 1, 2 and 4 times `block_m` are tried where at least 14 of them
     hold points, and the largest answer counts, since bending is slower than any one block; for
@@ -55,20 +92,17 @@ def jackknife(
     """
     best: NDArray[np.float64] | None = None
     blocks = 0
-    scale = np.array([length_m] * 3 + [1.0] * 3)
     for growth in _BLOCK_GROWTH:
-        block, count = blocks_of(pairs.points, block_m * growth)
+        block, count = blocks_of(points, block_m * growth)
         if count < _LEAST_BLOCKS or (best is not None and growth < 1.0):
             continue
-        H, g = normal_equations(
-            pairs.points - centre, pairs.normals, pairs.residuals, weights, block, count
-        )
+        H, g = equations(block, count)
         H_all, g_all = H.sum(axis=0), g.sum(axis=0)
-        steps = np.array([solve(H_all - H[b], g_all - g[b], dof, length_m) for b in range(count)])
+        steps = np.array([solved(H_all - H[b], g_all - g[b]) for b in range(count)])
         steps -= steps.mean(axis=0)
         covariance = (count - 1) / count * steps.T @ steps * ((count - 1) / (count - 8))
-        size = np.trace(covariance * np.outer(scale, scale))
-        if best is None or size > np.trace(best * np.outer(scale, scale)):
+        size = np.trace(covariance * np.outer(unit, unit))
+        if best is None or size > np.trace(best * np.outer(unit, unit)):
             best, blocks = covariance, count
     return best, blocks
 

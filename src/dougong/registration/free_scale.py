@@ -68,6 +68,10 @@ class ScaleSearch:
     """Best first, at least 3 % apart."""
     undecided: tuple[ScaleCandidate, ...]
     """Other scales that explain the metric cloud as well."""
+    control_points: int = 0
+    """Control points that the best scale was adjusted with."""
+    contradiction: str | None = None
+    """What the control points and the clouds hold against each other; None: nothing."""
 
 
 def free_side(source: Cloud, source_kind: Kind, target: Cloud, target_kind: Kind) -> Side:
@@ -103,7 +107,14 @@ def scaled(cloud: Prepared, factor: float) -> Prepared:
 
 
 def search_scale(
-    source: Cloud, target: Cloud, *, source_kind: Kind, target_kind: Kind, icp: Icp, dof: int
+    source: Cloud,
+    target: Cloud,
+    *,
+    source_kind: Kind,
+    target_kind: Kind,
+    icp: Icp,
+    dof: int,
+    side: Side | None = None,
 ) -> ScaleSearch:
     """Search the scale of the cloud that has no unit, over 0.01 to 100 metres per unit.
 
@@ -115,6 +126,8 @@ def search_scale(
         Settings of the fit.
     dof : int
         5 (levelled) or 7.
+    side : {"source", "target"}, optional
+        Which cloud has no unit; by default see `free_side`.
 
     Returns
     -------
@@ -126,9 +139,8 @@ def search_scale(
     Cost: about as many small plan searches as steps of 4 % fit between the sizes' bounds (a
     hundred at most), then six fits. Deterministic.
     """
-    side = free_side(source, source_kind, target, target_kind)
-    free, fixed = (source, target) if side == "source" else (target, source)
-    kinds = (source_kind, target_kind) if side == "source" else (target_kind, source_kind)
+    side = side or free_side(source, source_kind, target, target_kind)
+    free, fixed, kinds = _by_side(source, target, (source_kind, target_kind), side)
     metric = prepare(fixed, kinds[1], _THIN)
     grid = _grid(free.xyz, fixed.xyz)
     parts = max(1, int(np.ceil(np.log(grid[-1] / grid[0]) / np.log(_PREPARED_EVERY))))
@@ -146,6 +158,49 @@ def search_scale(
     kept = _distinct(found)
     undecided = tuple(c for c in kept[1:] if not _is_better(kept[0], c, metric))
     return ScaleSearch(side=side, candidates=tuple(kept), undecided=undecided)
+
+
+def scale_near(
+    source: Cloud,
+    target: Cloud,
+    metres_per_unit: float,
+    T: Transform,
+    *,
+    source_kind: Kind,
+    target_kind: Kind,
+    icp: Icp,
+    dof: int,
+    side: Side,
+) -> ScaleSearch:
+    """Fit the scale of one cloud, and the pose, near what is known of them.
+
+    Parameters
+    ----------
+    metres_per_unit : float
+        Of the free cloud, to a few per cent.
+    T : ndarray, shape (4, 4)
+        Rigid, source local -> target local with both in metres.
+
+    Returns
+    -------
+    ScaleSearch
+        At most one candidate; none: the clouds have too little in common there.
+    """
+    free, fixed, kinds = _by_side(source, target, (source_kind, target_kind), side)
+    k, metric = metres_per_unit, prepare(fixed, kinds[1], _THIN)
+    ready = prepare(with_unit(free, k), kinds[0], _THIN)
+    fit = fit_similarity(*_ordered(ready, metric, side), T, side, icp, dof)
+    found = () if fit is None else (_candidate(scaled(ready, 1.0 / k), k, metric, side, fit),)
+    return ScaleSearch(side=side, candidates=found, undecided=())
+
+
+def _by_side(
+    source: Cloud, target: Cloud, kinds: tuple[Kind, Kind], side: Side
+) -> tuple[Cloud, Cloud, tuple[Kind, Kind]]:
+    """Return the cloud without a unit, the other one, and their kinds in that order."""
+    if side == "source":
+        return source, target, kinds
+    return target, source, (kinds[1], kinds[0])
 
 
 def _grid(free: Points, fixed: Points) -> Values:
@@ -214,20 +269,26 @@ def _refined(
         fit = fit_similarity(source, target, hypothesis.T_target_source, side, icp, dof)
         if fit is None:
             continue
-        size = k * fit.factor
-        court = summon(*_ordered(scaled(ready, size), metric, side))
-        losses = _losses(court, fit.T_target_source, side)
-        weights = _weights(court, side)
-        loss = float(weights @ losses / max(float(weights.sum()), 1e-300))
-        if best is None or loss < best.loss:
-            best = ScaleCandidate(
-                metres_per_unit=size,
-                T_target_source=fit.T_target_source,
-                loss=loss,
-                losses=losses,
-                fit=fit,
-            )
+        candidate = _candidate(ready, k, metric, side, fit)
+        if best is None or candidate.loss < best.loss:
+            best = candidate
     return best
+
+
+def _candidate(
+    ready: Prepared, k: float, metric: Prepared, side: Side, fit: SimilarityFit
+) -> ScaleCandidate:
+    """Return what a fit that began at scale `k` explains of the metric cloud."""
+    size = k * fit.factor
+    court = summon(*_ordered(scaled(ready, size), metric, side))
+    losses, weights = _losses(court, fit.T_target_source, side), _weights(court, side)
+    return ScaleCandidate(
+        metres_per_unit=size,
+        T_target_source=fit.T_target_source,
+        loss=float(weights @ losses / max(float(weights.sum()), 1e-300)),
+        losses=losses,
+        fit=fit,
+    )
 
 
 def _losses(court: Court, T: Transform, side: Side) -> Values:

@@ -12,6 +12,9 @@ from dougong.cloud import Cloud
 from dougong.registration.free_scale import LEAST, MOST, ScaleSearch, with_unit
 from dougong.registration.result import Registration
 
+_OFF_SIGMAS = 3.3
+"""1 in 1000 by chance."""
+
 
 def refusal(found: ScaleSearch) -> str | None:
     """Return why there is no scale to go on with; None: there is one."""
@@ -57,6 +60,7 @@ def scale_document(found: ScaleSearch, source: Cloud, target: Cloud) -> dict[str
         "side": found.side,
         "metres_per_unit": None if best is None else best.metres_per_unit,
         "sigma_ln": None if covariance is None else float(np.sqrt(covariance[6, 6])),
+        "control_points": found.control_points,
         "candidates": rows,
     }
 
@@ -86,6 +90,7 @@ def with_scale(
     if status == "ok" and doubt is not None:
         status, reason = "ambiguous", doubt
     unit = f"one unit of {name} is {best.metres_per_unit:.6g} m (sigma {100 * sigma:.2g} %)"
+    reason = f"{reason} {unit[0].upper()}{unit[1:]}."
     notes = [note for note in result.notes if not note.startswith("units differ")]
     return replace(
         result,
@@ -96,12 +101,24 @@ def with_scale(
         scale_source="search",
         scale_search=scale_document(found, source, target),
         parameters={**result.parameters, "dof": dof},
-        notes=(*notes, f"the scale was searched: {unit}"),
+        notes=(*notes, f"{_origin(found)}: {unit}"),
+    )
+
+
+def _origin(found: ScaleSearch) -> str:
+    if not found.control_points:
+        return "the scale was searched"
+    plural = "s" if found.control_points != 1 else ""
+    return (
+        f"the scale follows from the clouds and {found.control_points} control point{plural} "
+        "together"
     )
 
 
 def _doubt(found: ScaleSearch, sigma: float, most_spread_m: float) -> str | None:
     best = found.candidates[0]
+    if found.contradiction is not None:
+        return found.contradiction
     if found.undecided:
         shown = ", ".join(f"{c.metres_per_unit:.4g}" for c in (best, *found.undecided))
         return (
@@ -115,6 +132,34 @@ def _doubt(found: ScaleSearch, sigma: float, most_spread_m: float) -> str | None
             f"the shared surface by {spread:.2g} m, at most {most_spread_m:.2g} m expected."
         )
     return None
+
+
+def is_off_metres(found: ScaleSearch) -> bool:
+    """Say whether a cloud that was taken for metres is off by more than chance (3.3 sigma)."""
+    if not found.candidates:
+        return False
+    best = found.candidates[0]
+    if not best.fit.holds_scale or best.fit.covariance is None:
+        return False
+    sigma = float(np.sqrt(best.fit.covariance[6, 6]))
+    return abs(float(np.log(best.metres_per_unit))) > _OFF_SIGMAS * sigma
+
+
+def metre_note(found: ScaleSearch, source: Cloud, target: Cloud) -> str:
+    """Return what is to be said of a cloud without a declared unit that stays in metres."""
+    name = source.name if found.side == "source" else target.name
+    best = found.candidates[0] if found.candidates else None
+    if best is None or not best.fit.holds_scale or best.fit.covariance is None:
+        return (
+            f"{name} declares no unit and is taken for metres: what both clouds share does not "
+            "hold its scale, so that could not be checked"
+        )
+    off = 100.0 * (best.metres_per_unit - 1.0)
+    sigma = 100.0 * float(np.sqrt(best.fit.covariance[6, 6]))
+    return (
+        f"{name} declares no unit and is taken for metres: its scale fits the other cloud's to "
+        f"{off:+.3f} % (sigma {sigma:.2g} %)"
+    )
 
 
 def in_found_unit(

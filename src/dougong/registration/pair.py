@@ -11,8 +11,16 @@ from dougong.registration.control import Control, local_control
 from dougong.registration.control_solve import ControlPoints
 from dougong.registration.decision import decide, refused
 from dougong.registration.file_coordinates import in_file_coordinates, unit_of
-from dougong.registration.free_scale import search_scale
-from dougong.registration.free_scale_result import in_metres, refusal, scale_document, with_scale
+from dougong.registration.free_scale import ScaleSearch, Side, scale_near
+from dougong.registration.free_scale_control import find_scale, with_control
+from dougong.registration.free_scale_result import (
+    in_metres,
+    is_off_metres,
+    metre_note,
+    refusal,
+    scale_document,
+    with_scale,
+)
 from dougong.registration.handedness import LEFT_SENTENCE
 from dougong.registration.laps import Laps
 from dougong.registration.picked_pairs import (
@@ -41,6 +49,8 @@ def register(
     target_kind: Kind = "photogrammetry",
     pairs: PickedPairs | None = None,
     control: ControlPoints | None = None,
+    unscaled: Side | None = None,
+    scale: ScaleSearch | None = None,
 ) -> Registration:
     """Find the motion from `source`'s file coordinates to `target`'s, and say how sure it is.
 
@@ -55,6 +65,11 @@ def register(
         Places that a person picked in both: their pose is heard beside those of the search.
     control : ControlPoints, optional
         Places surveyed in both frames: adjusted together with the clouds, or held out as checks.
+    unscaled : {"source", "target"}, optional
+        The cloud whose unit nothing declares. With ``dof`` auto it is taken for metres where that
+        holds, else its scale is freed.
+    scale : ScaleSearch, optional
+        What `find_scale` found before; both clouds have been brought to metres by it.
 
     Returns
     -------
@@ -76,8 +91,12 @@ def register(
     """
     params = params or Register()
     kinds = (source_kind, target_kind)
+    if scale is not None:
+        return _at_scale(source, target, scale, params, kinds, pairs, control)
     if params.dof in (5, 7):
-        return _with_free_scale(source, target, params, kinds, pairs, control)
+        return _with_free_scale(source, target, params, kinds, pairs, control, unscaled)
+    if params.dof == "auto" and unscaled is not None:
+        return _taken_for_metres(source, target, params, kinds, pairs, control, unscaled)
     if pairs is None:
         return _registered(source, target, params, kinds, None, control)
     fit = fit_pairs(pairs, source, target)
@@ -159,27 +178,110 @@ def _with_free_scale(
     kinds: tuple[Kind, Kind],
     pairs: PickedPairs | None,
     control: ControlPoints | None,
+    side: Side | None,
 ) -> Registration:
     """Search the scale, then register the clouds in metres."""
     clock = Laps()
-    dof: Literal[4, 6] = 4 if params.dof == 5 else 6
-    found = search_scale(
-        source, target, source_kind=kinds[0], target_kind=kinds[1], icp=params.icp, dof=dof + 1
+    found = find_scale(
+        source,
+        target,
+        params,
+        source_kind=kinds[0],
+        target_kind=kinds[1],
+        control=control,
+        side=side,
     )
     clock.lap("scale")
     why = refusal(found)
     if why is not None:
-        none = in_file_coordinates(refused(why), source, target, 1.0, params, clock, [])
-        return replace(none, dof=dof + 1, scale_search=scale_document(found, source, target))
-    one, two = in_metres(found, source, target)
+        return without_scale(why, found, source, target, params, clock)
+    result = _at_scale(*in_metres(found, source, target), found, params, kinds, pairs, control)
+    return replace(result, seconds={**clock.seconds, **result.seconds})
+
+
+def without_scale(
+    why: str,
+    found: ScaleSearch,
+    source: Cloud,
+    target: Cloud,
+    params: Register,
+    clock: Laps | None = None,
+) -> Registration:
+    """Return the answer where no scale could be found."""
+    none = in_file_coordinates(refused(why), source, target, 1.0, params, clock or Laps(), [])
+    dof = 5 if params.dof in (4, 5) else 7
+    return replace(none, dof=dof, scale_search=scale_document(found, source, target))
+
+
+def _at_scale(
+    source: Cloud,
+    target: Cloud,
+    found: ScaleSearch,
+    params: Register,
+    kinds: tuple[Kind, Kind],
+    pairs: PickedPairs | None,
+    control: ControlPoints | None,
+) -> Registration:
+    """Register two clouds that `found` has brought to metres; the result has its scale."""
+    dof: Literal[4, 6] = 4 if params.dof in (4, 5) else 6
     result = register(
-        one,
-        two,
+        source,
+        target,
         params.model_copy(update={"dof": dof}),
         source_kind=kinds[0],
         target_kind=kinds[1],
         pairs=pairs,
         control=control,
     )
-    result = replace(result, seconds={**clock.seconds, **result.seconds})
     return with_scale(result, found, (source, target), dof + 1, params.verdict.most_spread_m)
+
+
+def _taken_for_metres(
+    source: Cloud,
+    target: Cloud,
+    params: Register,
+    kinds: tuple[Kind, Kind],
+    pairs: PickedPairs | None,
+    control: ControlPoints | None,
+    side: Side,
+) -> Registration:
+    """Register a cloud whose unit nothing declares: in metres if that holds, else with its scale.
+
+    A file without a coordinate system is mostly in metres; photogrammetry that is not, or whose
+    metres are off by more than chance, is found out by the other cloud.
+    """
+    plain = params.model_copy(update={"dof": 6})
+    result = register(
+        source,
+        target,
+        plain,
+        source_kind=kinds[0],
+        target_kind=kinds[1],
+        pairs=pairs,
+        control=control,
+    )
+    free = params.model_copy(update={"dof": 7})
+    if result.status == "failed" or result.fine is None:
+        if params.coarse not in ("auto", "plan"):
+            return result
+        scaled = _with_free_scale(source, target, free, kinds, pairs, control, side)
+        if scaled.status == "failed":
+            said = "Taken for metres, and with its scale free: no pose was found either way."
+            return replace(result, reason=f"{result.reason} {said}")
+        return scaled
+    found = scale_near(
+        source,
+        target,
+        1.0,
+        result.fine.T_target_source,
+        source_kind=kinds[0],
+        target_kind=kinds[1],
+        icp=params.icp,
+        dof=7,
+        side=side,
+    )
+    if control is not None and found.candidates:
+        found = with_control(found, source, target, control, 7)
+    if is_off_metres(found):
+        return _at_scale(*in_metres(found, source, target), found, free, kinds, pairs, control)
+    return replace(result, notes=(*result.notes, metre_note(found, source, target)))

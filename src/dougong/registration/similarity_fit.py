@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong.filters.neighbourhood import build_index
-from dougong.registration.covariance import blocks_of
+from dougong.registration.covariance import blocks_of, leave_blocks_out
 from dougong.registration.icp import Icp, Level, build_levels, centre_and_length
 from dougong.registration.icp_solve import (
     gravity_prior,
+    grown_by,
     levelled,
-    moved_by,
     plane_rows,
     robust_weights,
     robust_widening,
@@ -24,14 +24,12 @@ from dougong.registration.icp_solve import (
 )
 from dougong.registration.overlap import Pairs, Rung, find_pairs
 from dougong.registration.prepare import Prepared
-from dougong.typing import Mask, Transform, Values
+from dougong.typing import Index, Mask, Transform, Values
 
 FREE_WITH_SCALE = {5: (2, 3, 4, 5, 6), 7: (0, 1, 2, 3, 4, 5, 6)}
 """Which of (omega, v, ln s) move, by degrees of freedom."""
 _LEAST_PAIRS = 60
 _FLOOR = 1e-5
-_LEAST_BLOCKS = 14
-_BLOCK_GROWTH = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
 _FACING = 0.3
 _LEAST_FACING_SHARE = 0.02
 _LEAST_FACING_BLOCKS = 3
@@ -48,6 +46,8 @@ class SimilarityFit:
     covariance: NDArray[np.float64] | None
     """(7, 7) of (omega rad, v m, ln s) about `centre`, block jackknife; None: too few blocks.
     For x' = c + s Exp(omega)(x - c) + v; s scales the *source*, whichever cloud is free."""
+    blocks: int
+    """Blocks of surface behind `covariance`; 0 where it is None."""
     centre: NDArray[np.float64]
     """(3,), local target coordinates, metres."""
     length_m: float
@@ -90,17 +90,17 @@ def fit_similarity(
     fitted = None
     for number, level in enumerate(build_levels(source, target, _settings(icp, source, target))):
         for _ in range(10):
-            fitted = _paired(_grown(level, factor, side), T, icp)
+            fitted = _paired(_scaled_level(level, factor, side), T, icp)
             if fitted is None:
                 return None
             step, length = _step(fitted, T, level, icp, free)
-            T, factor = _moved(T, factor, step, fitted.centre, side)
+            T, factor = grown(T, factor, step, fitted.centre, side)
             motion = length * (np.linalg.norm(step[:3]) + abs(step[6])) + np.linalg.norm(step[3:6])
             if motion < (1e-3 if number < 2 else 2e-5):
                 break
             if not 0.7 < factor < 1.4:
                 return None
-    fitted = _paired(_grown(level, factor, side), T, icp)
+    fitted = _paired(_scaled_level(level, factor, side), T, icp)
     return None if fitted is None else _result(fitted, T, factor, icp, free)
 
 
@@ -131,14 +131,14 @@ class _Fitted:
     scale_m: float
 
 
-def _grown(level: Level, factor: float, side: str) -> Level:
+def _scaled_level(level: Level, factor: float, side: str) -> Level:
     """Return the level with its free cloud multiplied by `factor`."""
     if side == "source":
-        return replace(level, source=_grown_rung(level.source, factor))
-    return replace(level, target=_grown_rung(level.target, factor))
+        return replace(level, source=_scaled_rung(level.source, factor))
+    return replace(level, target=_scaled_rung(level.target, factor))
 
 
-def _grown_rung(rung: Rung, factor: float) -> Rung:
+def _scaled_rung(rung: Rung, factor: float) -> Rung:
     xyz = rung.xyz * factor
     return replace(rung, xyz=xyz, neighbours=build_index(xyz))
 
@@ -192,7 +192,7 @@ def _solved(
     return step
 
 
-def _moved(
+def grown(
     T: Transform, factor: float, step: NDArray[np.float64], centre: NDArray[np.float64], side: str
 ) -> tuple[Transform, float]:
     """Return pose and factor after x' = c + s Exp(omega)(x - c) + v, one cloud scaled by it.
@@ -201,10 +201,8 @@ def _moved(
     divided by s instead, so that the source keeps its metres.
     """
     s = float(np.exp(step[6]))
-    turned = moved_by(T, np.concatenate([step[:3], np.zeros(3)]), np.zeros(3))
-    arm = turned[:3, 3] - turned[:3, :3] @ T[:3, :3].T @ centre
-    result = turned.copy()
-    result[:3, 3] = centre + step[3:6] + s * arm
+    result = grown_by(T, step, centre)
+    result[:3, :3] /= s
     if side == "source":
         return result, factor * s
     result[:3, 3] /= s
@@ -214,43 +212,44 @@ def _moved(
 def _result(
     fitted: _Fitted, T: Transform, factor: float, icp: Icp, free: Sequence[int]
 ) -> SimilarityFit:
-    covariance = _jackknife(fitted, free, icp.block_m)
+    covariance, blocks = _jackknife(fitted, free, icp.block_m)
     pairs = fitted.pairs
     widening = robust_widening(np.abs(pairs.residuals), pairs.weights, fitted.scale_m, icp.robust)
     return SimilarityFit(
         T_target_source=T,
         factor=factor,
         covariance=None if covariance is None else widening * covariance,
+        blocks=blocks,
         centre=fitted.centre,
         length_m=fitted.length,
         holds_scale=_holds_scale(fitted, free, icp.block_m),
     )
 
 
-def _jackknife(fitted: _Fitted, free: Sequence[int], block_m: float) -> NDArray[np.float64] | None:
-    """Return the (7, 7) covariance by leaving blocks out, as `covariance.jackknife` does for 6."""
-    best: NDArray[np.float64] | None = None
-    unit = np.array([fitted.length] * 3 + [1.0] * 3 + [fitted.length])
-    for growth in _BLOCK_GROWTH:
-        block, count = blocks_of(fitted.pairs.points, block_m * growth)
-        if count < _LEAST_BLOCKS or (best is not None and growth < 1.0):
-            continue
+def _jackknife(
+    fitted: _Fitted, free: Sequence[int], block_m: float
+) -> tuple[NDArray[np.float64] | None, int]:
+    """Return the (7, 7) covariance, and the number of blocks behind it."""
+
+    def equations(block: Index, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         H, g = np.zeros((count, 7, 7)), np.zeros((count, 7))
+        order = np.argsort(block, kind="stable")
+        ends = np.searchsorted(block[order], np.arange(count + 1))
         for b in range(count):
-            here = block == b
+            here = order[ends[b] : ends[b + 1]]
             rows, weights = fitted.rows[here], fitted.weights[here]
             H[b] = (rows * weights[:, None]).T @ rows
             g[b] = rows.T @ (weights * fitted.pairs.residuals[here])
-        H_all, g_all = H.sum(axis=0), g.sum(axis=0)
-        steps = np.array(
-            [_solved(H_all - H[b], g_all - g[b], free, fitted.length) for b in range(count)]
-        )
-        steps -= steps.mean(axis=0)
-        covariance = (count - 1) / count * steps.T @ steps * ((count - 1) / (count - 8))
-        size = np.trace(covariance * np.outer(unit, unit))
-        if best is None or size > np.trace(best * np.outer(unit, unit)):
-            best = covariance
-    return best
+        return H, g
+
+    unit = np.array([fitted.length] * 3 + [1.0] * 3 + [fitted.length])
+    return leave_blocks_out(
+        fitted.pairs.points,
+        equations,
+        lambda H, g: _solved(H, g, free, fitted.length),
+        unit,
+        block_m,
+    )
 
 
 def _holds_scale(fitted: _Fitted, free: Sequence[int], block_m: float) -> bool:
