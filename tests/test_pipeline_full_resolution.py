@@ -39,7 +39,7 @@ def short_cuts(monkeypatch):
             hypotheses=(Hypothesis(T_target_source=motion(), score=0.7, method="plan"),),
         )  # fmt: skip
 
-    monkeypatch.setattr("dougong.pipeline.run.register", register)
+    monkeypatch.setattr("dougong.pipeline.links.register", register)
 
 
 @pytest.fixture

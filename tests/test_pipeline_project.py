@@ -21,6 +21,7 @@ name = "drone"
 kind = "photogrammetry"
 files = ["drone.laz"]
 """
+UNSCALED = GOOD.rstrip() + "\nscale_known = false\n"
 
 
 @pytest.fixture
@@ -49,6 +50,10 @@ def test_the_reference_is_the_first_photogrammetry_cloud_else_the_first_lidar(pr
     assert from_files([Path("a.laz")], [Path("x.copc.laz")]).reference() == "x"
 
 
+def test_a_cloud_without_a_unit_is_no_reference(project):
+    assert read_project(project(UNSCALED)).reference() == "scan"
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -61,7 +66,11 @@ def test_the_reference_is_the_first_photogrammetry_cloud_else_the_first_lidar(pr
         (GOOD + "[registr]\ncoarse='auto'", "'registr', did you mean 'register'"),
         (GOOD + "[register]\ndof=3", r"register\.dof"),
         (GOOD + "[filter.lidar.octree_voxel_grid]\nvoxel=1", "did you mean 'voxel_m'"),
-        (GOOD.replace('"lidar"', '"lidar"\nscale_known = false'), "must be in known units"),
+        (GOOD + "[register]\ndof=7", "every cloud's scale is known"),
+        (GOOD.replace("kind", "scale_known = false\nkind"), "every cloud has scale_known = false"),
+        (UNSCALED.replace("[[cloud]]", '[project]\nreference="drone"\n[[cloud]]', 1), "no unit"),
+        (UNSCALED + 'crs = "EPSG:32650"', "and a crs"),
+        (UNSCALED + "registered = false", "registered = false: one scale"),
         (GOOD + "[[", "no valid TOML"),
     ],
 )

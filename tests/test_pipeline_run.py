@@ -29,7 +29,7 @@ def cloud(seed, offset=(0.0, 0.0, 0.0)):
 def answer(status):
     """A registration that says `status` and shifts by SHIFT."""
 
-    def register(source, target, params, *, source_kind, target_kind, control=None):
+    def register(source, target, params, *, source_kind, target_kind, control=None, **_):
         assert params.filtered
         matrix = np.eye(4)
         matrix[:3, 3] = SHIFT
@@ -82,7 +82,7 @@ def clouds(folder, *, registered="true", more=""):
 
 
 def test_files_of_one_cloud_move_together(folder, capsys, monkeypatch):
-    monkeypatch.setattr("dougong.pipeline.run.register", answer("ok"))
+    monkeypatch.setattr("dougong.pipeline.links.register", answer("ok"))
     code, result = run(capsys, clouds(folder), "--out", folder / "out")
     assert code == 0
     assert [entry["name"] for entry in result["clouds"]] == ["scans", "map"]
@@ -100,7 +100,7 @@ def test_files_of_one_cloud_move_together(folder, capsys, monkeypatch):
 
 
 def test_the_option_brings_every_point_back(folder, capsys, monkeypatch):
-    monkeypatch.setattr("dougong.pipeline.run.register", answer("ok"))
+    monkeypatch.setattr("dougong.pipeline.links.register", answer("ok"))
     _, best = run(capsys, clouds(folder), "--out", folder / "best")
     _, every = run(capsys, clouds(folder), "--out", folder / "all", "--merge", "all")
     assert every["merged"]["left_out"] == 0 < best["merged"]["left_out"]
@@ -123,7 +123,7 @@ def test_the_scanners_frame_can_be_the_reference(folder, capsys, monkeypatch):
     dougong.write(Cloud.from_points(high, crs="EPSG:32650"), folder / "map.laz", overwrite=True)
     found = replace(answer("ok")(flown, None, Register(filtered=True), source_kind=None,
                                  target_kind=None), matrix=inverse(on_map))  # fmt: skip
-    monkeypatch.setattr("dougong.pipeline.run.register", lambda *_, **__: found)
+    monkeypatch.setattr("dougong.pipeline.links.register", lambda *_, **__: found)
     project = clouds(folder, more='[project]\nreference = "scans"\n[merge]\nmode = "all"\n')
     code, result = run(capsys, project, "--out", folder / "out")
     assert (code, result["reference"]) == (0, "scans")
@@ -143,7 +143,7 @@ def test_the_scanners_frame_can_be_the_reference(folder, capsys, monkeypatch):
 
 def test_stations_that_are_not_registered_move_by_themselves(folder, capsys, monkeypatch):
     status = {"scans-1": "ok", "scans-2": "ambiguous"}
-    monkeypatch.setattr("dougong.pipeline.run.register", answer(status))
+    monkeypatch.setattr("dougong.pipeline.links.register", answer(status))
     project = clouds(folder, registered="false")
     code, result = run(capsys, project, "--out", folder / "out")
     assert code == 3
@@ -170,7 +170,7 @@ def test_what_was_removed_is_kept_to_be_looked_at(folder, capsys, monkeypatch):
     strays = np.random.default_rng(7).uniform([0, 0, 5], [10, 10, 12], (30, 3))
     file = folder / "one.laz"
     dougong.write(Cloud.from_points(np.vstack([cloud(0).xyz, strays])), file, overwrite=True)
-    monkeypatch.setattr("dougong.pipeline.run.register", answer("ok"))
+    monkeypatch.setattr("dougong.pipeline.links.register", answer("ok"))
     tokens = ("--lidar", folder / "one.laz", "--photogrammetry", folder / "map.laz")
     _, result = run(capsys, *tokens, "--out", folder / "out")
     one = result["clouds"][0]
@@ -198,7 +198,7 @@ def test_the_removed_points_that_are_kept_do_not_depend_on_the_order():
 
 @pytest.mark.parametrize("status", ["ambiguous", "failed"])
 def test_an_unsure_pose_is_not_merged_and_exits_3(folder, status, capsys, monkeypatch):
-    monkeypatch.setattr("dougong.pipeline.run.register", answer(status))
+    monkeypatch.setattr("dougong.pipeline.links.register", answer(status))
     tokens = ("--lidar", folder / "one.laz", "--photogrammetry", folder / "map.laz")
     code, result = run(capsys, *tokens, "--out", folder / "out")
     assert (code, result["status"], result["merged"]["clouds"]) == (3, status, ["map"])
@@ -208,7 +208,7 @@ def test_an_unsure_pose_is_not_merged_and_exits_3(folder, status, capsys, monkey
 
 
 def test_the_best_pose_is_taken_when_the_project_says_so(folder, capsys, monkeypatch):
-    monkeypatch.setattr("dougong.pipeline.run.register", answer("ambiguous"))
+    monkeypatch.setattr("dougong.pipeline.links.register", answer("ambiguous"))
     project = clouds(folder, more="[register]\naccept_best = true\n")
     code, result = run(capsys, project, "--out", folder / "out")
     assert (code, result["status"]) == (0, "ambiguous")
@@ -236,7 +236,7 @@ def test_a_failing_job_leaves_nothing(folder, capsys, monkeypatch):
     def broken(*args, **kwargs):
         raise dougong.RegistrationError("no overlap at all.")
 
-    monkeypatch.setattr("dougong.pipeline.run.register", broken)
+    monkeypatch.setattr("dougong.pipeline.links.register", broken)
     code, document = run(capsys, clouds(folder), "--out", folder / "out")
     assert (code, document["error"]["type"]) == (1, "RegistrationError")
     assert not (folder / "out").exists()

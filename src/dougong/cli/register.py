@@ -61,7 +61,7 @@ def command(
         How the pose is refined.
     dof
         4: levelled, 6: rigid, 5 and 7: the same with a free scale; auto: 6 with a gravity prior,
-        4 only where both prove levelled.
+        and the scale of photogrammetry that declares no unit.
     filtered
         The inputs are clean already; nothing is dropped as noise.
     yaw_hint

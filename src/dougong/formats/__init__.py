@@ -13,6 +13,7 @@ from dougong.formats.model import FileInfo, Finding, PlacedStation, Written
 from dougong.formats.registry import (
     SUFFIXES,
     WRITABLE,
+    has_metric_format,
     iterate,
     read,
     read_stations,
@@ -34,6 +35,7 @@ __all__ = [
     "copy_file",
     "describe",
     "faults_of",
+    "has_metric_format",
     "in_system",
     "is_same_crs",
     "iterate",

@@ -12,6 +12,7 @@ from dougong.typing import Points
 
 SAMPLE = 200_000
 """Points that shape the robust box."""
+NO_SYSTEM = "no coordinate reference system is named; its numbers are taken as metres."
 _FAR_FACTOR = 10.0
 _FAR_LEAST_M = 100.0
 _HIGH_M = 1000.0
@@ -125,7 +126,7 @@ def faults_in_words(
     """
     found = []
     if frame.crs is None:
-        found.append("no coordinate reference system is named; its numbers are taken as metres.")
+        found.append(NO_SYSTEM)
     if copies:
         found.append(f"{copies:,} of {points:,} points lie exactly on another one.")
     if far:

@@ -1,6 +1,6 @@
 """From a project's entries to the clouds that move: read, filtered, named."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from dougong.cloud import Cloud
 from dougong.errors import FrameError
 from dougong.filters.selection import Reason
 from dougong.formats import describe, faults_of, in_system, is_same_crs, read, read_stations
+from dougong.formats.faults import NO_SYSTEM
 from dougong.pipeline.memory import Room
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Entry, files_of
@@ -27,6 +28,8 @@ from dougong.pipeline.tiled import (
     stations_of,
     undecimated,
 )
+from dougong.registration.free_scale import ScaleSearch, with_unit, without_unit
+from dougong.registration.free_scale_result import refusal
 from dougong.typing import Kind
 
 
@@ -57,7 +60,8 @@ class Mover:
     entry: str
     kind: Kind
     sources: tuple[Source, ...]
-    scale_known: bool
+    scale: ScaleSearch | None = None
+    """What brought its clouds to metres; None: their unit was known."""
 
     @property
     def clouds(self) -> list[Cloud]:
@@ -82,21 +86,31 @@ class Mover:
         FrameError
             The files differ in coordinate system or unit.
         """
-        clouds = self.clouds
-        if len(clouds) == 1:
-            return replace(clouds[0], name=self.name)
-        first = clouds[0].frame
-        for cloud in clouds[1:]:
-            frame = cloud.frame
-            if not is_same_crs(frame.crs, first.crs) or frame.unit_m != first.unit_m:
-                msg = (
-                    f"cloud {self.name!r}: {clouds[0].name} and {cloud.name} differ in coordinate "
-                    "system or unit. Reproject one, or list them as clouds of their own."
-                )
-                raise FrameError(msg)
-        xyz = np.concatenate([cloud.rebased(first.origin).xyz for cloud in clouds])
-        records = np.zeros(len(xyz), dtype=[("file", "<u2")])
-        return Cloud(xyz=xyz, records=records, frame=first, name=self.name)
+        return joined(self.clouds, self.name)
+
+
+def joined(clouds: Sequence[Cloud], name: str) -> Cloud:
+    """Return the points of several clouds as one, coordinates only; a single one as it is.
+
+    Raises
+    ------
+    FrameError
+        They differ in coordinate system or unit.
+    """
+    if len(clouds) == 1:
+        return replace(clouds[0], name=name)
+    first = clouds[0].frame
+    for cloud in clouds[1:]:
+        frame = cloud.frame
+        if not is_same_crs(frame.crs, first.crs) or frame.unit_m != first.unit_m:
+            msg = (
+                f"cloud {name!r}: {clouds[0].name} and {cloud.name} differ in coordinate "
+                "system or unit. Reproject one, or list them as clouds of their own."
+            )
+            raise FrameError(msg)
+    xyz = np.concatenate([cloud.rebased(first.origin).xyz for cloud in clouds])
+    records = np.zeros(len(xyz), dtype=[("file", "<u2")])
+    return Cloud(xyz=xyz, records=records, frame=first, name=name)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -113,9 +127,18 @@ class Loader:
     inputs: dict[Path, dict[str, Any]] = field(default_factory=dict)
     held: dict[Path, int] = field(default_factory=dict)
     """Filtered points of each file, which wait in memory."""
+    units: dict[str, float | None] = field(default_factory=dict)
+    """Metres per unit of the project's clouds whose scale was searched; None: none was found."""
 
-    def movers(self, entry: Entry) -> list[Mover]:
-        """Return what moves as one of a project's cloud, read and filtered."""
+    def movers(self, entry: Entry, scale: ScaleSearch | None = None) -> list[Mover]:
+        """Return what moves as one of a project's cloud, read and filtered.
+
+        A cloud without a unit is filtered in the metres of `scale`; where that has none, it stays
+        as it is.
+        """
+        if scale is not None:
+            is_found = refusal(scale) is None
+            self.units[entry.name] = scale.candidates[0].metres_per_unit if is_found else None
         sources = [
             source for file in files_of(entry, self.folder) for source in self._sources(entry, file)
         ]
@@ -127,7 +150,7 @@ class Loader:
                 entry=entry.name,
                 kind=entry.kind,
                 sources=group,
-                scale_known=entry.scale_known,
+                scale=scale,
             )
             for index, group in enumerate(groups, 1)
         ]
@@ -137,7 +160,9 @@ class Loader:
         with self.clock.measure("read"):
             digest = sha256(file)
         waiting = sum(self.held.values())
-        if entry.kind == "lidar" and is_too_large(file, self.room, waiting):
+        if entry.name in self.units and self.units[entry.name] is None:
+            found = self._unfiltered(entry, file)
+        elif entry.kind == "lidar" and is_too_large(file, self.room, waiting):
             found = self._on_tiles(entry, file, digest)
         else:
             found = self._whole(entry, file, digest)
@@ -147,11 +172,34 @@ class Loader:
             self.held[file] = self.held.get(file, 0) + len(source.filtered.cloud)
             yield source
 
+    def _placed(self, entry: Entry, cloud: Cloud) -> Cloud:
+        """Return a cloud in the system that its entry names, or in the unit that was found."""
+        if entry.name not in self.units:
+            return in_system(cloud, entry.crs)
+        said = "has a coordinate system, which is not believed: its scale is not known"
+        notes = (*cloud.notes, said) if cloud.frame.crs is not None else cloud.notes
+        bare = replace(without_unit(cloud), notes=notes)
+        return with_unit(bare, self.units[entry.name] or 1.0)
+
+    def _noticed(self, entry: Entry, cloud: Cloud) -> tuple[str, ...]:
+        """Return what is odd about a cloud; that it names no system is not, where it has a unit."""
+        said = (*cloud.notes, *faults_of(cloud))
+        return tuple(n for n in said if entry.name not in self.units or n != NO_SYSTEM)
+
+    def _unfiltered(self, entry: Entry, file: Path) -> Iterator[Source]:
+        """Read the file and leave it as it is: its unit is not known, and filters need metres."""
+        with self.clock.measure("read"):
+            cloud = self._placed(entry, read(file))
+        nothing = np.zeros(len(cloud), dtype=np.uint8)
+        filtered = Filtered(cloud=cloud, codes=nothing, ground_class=nothing, stages=())
+        noticed = (*self._noticed(entry, cloud), "not filtered, since its scale is not known")
+        yield self._source(entry, file, -1, filtered, noticed, cloud.select(np.arange(0)))
+
     def _whole(self, entry: Entry, file: Path, digest: str) -> Iterator[Source]:
         """Read the file, then filter its clouds one by one."""
         with self.clock.measure("read"):
             clouds = [read(file)] if entry.registered else read_stations(file)
-            clouds = [in_system(cloud, entry.crs) for cloud in clouds]
+            clouds = [self._placed(entry, cloud) for cloud in clouds]
         for station in range(len(clouds)):
             # Each raw cloud is let go as soon as it is filtered.
             cloud, clouds[station] = clouds[station], clouds[station].select(np.arange(0))
@@ -164,7 +212,7 @@ class Loader:
                 yield self._source(entry, file, station, books.on(kept), books.noticed, removed)
                 continue
             with self.clock.measure("filter"):
-                noticed = (*cloud.notes, *faults_of(cloud))
+                noticed = self._noticed(entry, cloud)
                 filtered = filter_cloud(cloud, entry.kind, self.recipe, self.progress)
             self.store.save(key, filtered, noticed)
             removed = removed_sample(cloud, filtered.codes, details=filtered.details)
@@ -179,7 +227,7 @@ class Loader:
         )
         points = describe(file).points
         for station, raw in enumerate(stations_of(file, split=not entry.registered)):
-            chunks = (in_system(chunk, entry.crs) for chunk in raw)
+            chunks = (self._placed(entry, chunk) for chunk in raw)
             key = self._key(entry, digest, station)
             books = self.store.load(key)
             if books is not None:
@@ -206,6 +254,7 @@ class Loader:
     def _key(self, entry: Entry, digest: str, station: int) -> str:
         params = self.recipe.lidar if entry.kind == "lidar" else self.recipe.photogrammetry
         digest += f" in {entry.crs}" if entry.crs is not None else ""
+        digest += f" at {self.units[entry.name]!r} m" if entry.name in self.units else ""
         return self.store.key(digest, -1 if entry.registered else station, entry.kind, params)
 
     def _say_known(self, name: str) -> None:

@@ -22,7 +22,8 @@ class Head(Parameters):
     name: str = "dougong project"
     """Title of the report."""
     reference: str | None = None
-    """Cloud in whose frame the result is; default: the first photogrammetry cloud, else lidar."""
+    """Cloud in whose frame the result is; default: the first photogrammetry cloud, else lidar, in
+    known units."""
     full_resolution: bool = False
     """Also write every input file, undecimated, in the frame of the reference."""
 
@@ -74,6 +75,44 @@ class Project(Parameters):
         return clouds
 
     @model_validator(mode="after")
+    def _scales_can_be_found(self) -> "Project":
+        unscaled = [entry for entry in self.cloud if not entry.scale_known]
+        for entry in unscaled:
+            if not entry.registered:
+                msg = (
+                    f"cloud {entry.name!r} has scale_known = false and registered = false: one "
+                    "scale is searched per cloud. List files of different blocks as clouds of "
+                    "their own"
+                )
+                raise ValueError(msg)
+            if entry.crs is not None:
+                msg = (
+                    f"cloud {entry.name!r} has scale_known = false and a crs, which would give its "
+                    "unit. Take one of them out"
+                )
+                raise ValueError(msg)
+        if self.registration.dof in (5, 7) and not unscaled:
+            msg = (
+                f"register.dof is {self.registration.dof}, but every cloud's scale is known: write "
+                "scale_known = false in the cloud whose scale is to be searched"
+            )
+            raise ValueError(msg)
+        if len(unscaled) == len(self.cloud):
+            msg = (
+                "every cloud has scale_known = false; one in known units is expected, to measure "
+                "the others by. Laser scans are in metres"
+            )
+            raise ValueError(msg)
+        wanted = self.project.reference
+        if wanted in [entry.name for entry in unscaled]:
+            msg = (
+                f"project.reference names {wanted!r}, which has scale_known = false: a result in "
+                "its frame would have no unit. Name a cloud in known units, or leave it out"
+            )
+            raise ValueError(msg)
+        return self
+
+    @model_validator(mode="after")
     def _reference_exists(self) -> "Project":
         names = [entry.name for entry in self.cloud]
         wanted = self.project.reference
@@ -89,8 +128,9 @@ class Project(Parameters):
         """Return the name of the cloud in whose frame the result is."""
         if self.project.reference is not None:
             return self.project.reference
-        drones = [entry.name for entry in self.cloud if entry.kind == "photogrammetry"]
-        return drones[0] if drones else self.cloud[0].name
+        known = [entry for entry in self.cloud if entry.scale_known]
+        drones = [entry.name for entry in known if entry.kind == "photogrammetry"]
+        return drones[0] if drones else known[0].name
 
 
 def read_project(path: Path) -> Project:
@@ -117,19 +157,6 @@ def read_project(path: Path) -> Project:
         msg = f"{path} is no valid TOML: {error}. Compare it with the output of `dougong init`."
         raise InputError(msg) from None
     project = validated(Project, values, str(path))
-    unscaled = [entry.name for entry in project.cloud if not entry.scale_known]
-    if unscaled or project.registration.dof in (5, 7):
-        asked = (
-            f"cloud {unscaled[0]!r} has scale_known = false"
-            if unscaled
-            else f"register.dof is {project.registration.dof}"
-        )
-        msg = (
-            f"{path}: {asked}, but a project's clouds must be in known units: the filters need "
-            "metres. Find the scale with `dougong register SOURCE TARGET --dof 7`, scale the cloud "
-            "by its metres_per_unit, and take the setting out."
-        )
-        raise InputError(msg)
     return project
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from dougong.cloud import Cloud
 from dougong.errors import FrameError
-from dougong.formats import is_same_crs, require_metric, units_of
+from dougong.formats import has_metric_format, is_same_crs, require_metric, units_of
 from dougong.formats.faults import coordinate_hashes
 from dougong.formats.projection import is_same_plan, projection_problem
 from dougong.pipeline.axes import mirrored_axes, upside_down
@@ -15,6 +15,8 @@ from dougong.registration import Register
 from dougong.registration import register as search
 from dougong.registration.control_solve import ControlPoints
 from dougong.registration.file_coordinates import unit_of
+from dougong.registration.free_scale import ScaleSearch, Side
+from dougong.registration.free_scale_control import find_scale
 from dougong.registration.picked_pairs import PickedPairs
 from dougong.registration.result import Registration
 from dougong.typing import Kind
@@ -33,11 +35,14 @@ def register(
     target_kind: Kind = "photogrammetry",
     pairs: PickedPairs | None = None,
     control: ControlPoints | None = None,
+    scale: ScaleSearch | None = None,
+    is_declared: bool = False,
 ) -> Registration:
     """Register two clouds, with what their reference systems say of units, maps and heights.
 
     Parameters and result are those of `dougong.registration.register`; pairs and control points
-    are in file coordinates.
+    are in file coordinates. Photogrammetry that declares no unit is `unscaled` there, unless
+    `is_declared`: the user says that both clouds are in known units.
 
     Raises
     ------
@@ -57,6 +62,7 @@ def register(
     if mirrored is not None:
         raise FrameError(mirrored)
     params = params or Register()
+    undeclared = undeclared_side(source, target, (source_kind, target_kind))
     one, two = without_copies(source), without_copies(target)
     pair, notes = pair_on_ground(one, two, params.grid_scale)
     if pair is not None:
@@ -71,6 +77,8 @@ def register(
         target_kind=target_kind,
         pairs=pairs,
         control=control,
+        unscaled=None if scale is not None or is_declared else undeclared,
+        scale=scale,
     )
     is_rigid = params.dof not in (5, 7)
     if result.status == "failed" and is_rigid and params.coarse in ("auto", "plan"):
@@ -79,7 +87,60 @@ def register(
     if pair is not None:
         result = to_file(result, pair, source, target)
     notes = (*notes, *height_note(result, source, target))
+    if is_declared and undeclared is not None and result.status != "ok":
+        name = (source if undeclared == "source" else target).name
+        notes = (*notes, _undeclared_note(name))
     return replace(result, notes=(*different_systems(source, target), *notes, *result.notes))
+
+
+def find_unit(
+    source: Cloud,
+    target: Cloud,
+    params: Register,
+    *,
+    source_kind: Kind,
+    target_kind: Kind,
+    control: ControlPoints | None = None,
+) -> ScaleSearch:
+    """Find the unit of a source that has none, in ground metres; see `find_scale`."""
+    require_metric(target)
+    require_registrable(target)
+    one, two = without_copies(source), without_copies(target)
+    pair, _ = pair_on_ground(one, two, params.grid_scale)
+    if pair is not None:
+        one, two = pair.source.cloud, pair.target.cloud
+        control = None if control is None else pair.on_ground(control)
+    return find_scale(
+        one,
+        two,
+        params,
+        source_kind=source_kind,
+        target_kind=target_kind,
+        control=control,
+        side="source",
+    )
+
+
+def _undeclared_note(name: str) -> str:
+    return (
+        f"{name} names no coordinate system, so nothing in the file says that it is in metres; if "
+        "it may not be, write scale_known = false in its [[cloud]] and its scale is searched"
+    )
+
+
+def undeclared_side(source: Cloud, target: Cloud, kinds: tuple[Kind, Kind]) -> Side | None:
+    """Return which cloud has a scale that nothing declares; None: neither, or both.
+
+    Photogrammetry has no scale of its own. A reference system gives it one, and so does a format
+    whose lengths are metres by definition (E57). Scanners measure metres.
+    """
+    undeclared = [
+        kind == "photogrammetry" and cloud.frame.crs is None and not has_metric_format(cloud)
+        for cloud, kind in zip((source, target), kinds, strict=True)
+    ]
+    if undeclared[0] == undeclared[1]:
+        return None
+    return "source" if undeclared[0] else "target"
 
 
 def height_note(result: Registration, source: Cloud, target: Cloud) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from dougong.formats import (
     in_system,
     read,
 )
+from dougong.formats.faults import NO_SYSTEM
 from dougong.pipeline.control import read_control, require_control_of
 from dougong.pipeline.distances import Measured, distances_document, measure, write_distances
 from dougong.pipeline.exports import Ends, write_registration
@@ -75,7 +76,7 @@ def register_files(
         pairs=picked,
         control=surveyed,
     )
-    result = replace(result, notes=(*one.notes, *two.notes, *result.notes))
+    result = replace(result, notes=(*_still_true(result, one, two), *result.notes))
     measured = None
     if result.status == "ok" or params.accept_best:
         progress.stage(f"measuring {source.name} against {target.name}")
@@ -120,6 +121,17 @@ def _read(path: Path, kind: Kind | None, system: str | None, progress: Progress)
         record={"path": str(path), "sha256": sha256(path), "points": len(cloud)},
         notes=(*guessed, *noticed),
     )
+
+
+def _still_true(result: Registration, source: _Input, target: _Input) -> list[str]:
+    """Return the notes of both files without "taken as metres" where a scale was found."""
+    searched = (result.scale_search or {}).get("side")
+    return [
+        note
+        for side, one in (("source", source), ("target", target))
+        for note in one.notes
+        if not (side == searched and note.endswith(NO_SYSTEM))
+    ]
 
 
 def _document(

@@ -94,6 +94,12 @@ def with_unit(cloud: Cloud, metres_per_unit: float) -> Cloud:
     return replace(cloud, xyz=cloud.xyz * metres_per_unit, frame=frame)
 
 
+def without_unit(cloud: Cloud) -> Cloud:
+    """Return `cloud` with its numbers as they stand: no reference system, no unit."""
+    (unit, *_) = cloud.frame.unit_m
+    return with_unit(cloud, 1.0 / unit)
+
+
 def scaled(cloud: Prepared, factor: float) -> Prepared:
     """Return a prepared cloud with every length multiplied."""
     return replace(

@@ -90,7 +90,7 @@ def with_scale(
     if status == "ok" and doubt is not None:
         status, reason = "ambiguous", doubt
     unit = f"one unit of {name} is {best.metres_per_unit:.6g} m (sigma {100 * sigma:.2g} %)"
-    reason = f"{reason} {unit[0].upper()}{unit[1:]}."
+    reason = f"{reason} {_origin(found)}: {unit}."
     notes = [note for note in result.notes if not note.startswith("units differ")]
     return replace(
         result,
@@ -101,16 +101,16 @@ def with_scale(
         scale_source="search",
         scale_search=scale_document(found, source, target),
         parameters={**result.parameters, "dof": dof},
-        notes=(*notes, f"{_origin(found)}: {unit}"),
+        notes=tuple(notes),
     )
 
 
 def _origin(found: ScaleSearch) -> str:
     if not found.control_points:
-        return "the scale was searched"
+        return "The scale was searched"
     plural = "s" if found.control_points != 1 else ""
     return (
-        f"the scale follows from the clouds and {found.control_points} control point{plural} "
+        f"The scale follows from the clouds and {found.control_points} control point{plural} "
         "together"
     )
 

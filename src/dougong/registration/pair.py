@@ -69,7 +69,8 @@ def register(
         The cloud whose unit nothing declares. With ``dof`` auto it is taken for metres where that
         holds, else its scale is freed.
     scale : ScaleSearch, optional
-        What `find_scale` found before; both clouds have been brought to metres by it.
+        What `find_scale` found before; both clouds have been brought to metres by it, unless it
+        found none.
 
     Returns
     -------
@@ -92,6 +93,9 @@ def register(
     params = params or Register()
     kinds = (source_kind, target_kind)
     if scale is not None:
+        why = refusal(scale)
+        if why is not None:
+            return _without_scale(why, scale, source, target, params, Laps())
         return _at_scale(source, target, scale, params, kinds, pairs, control)
     if params.dof in (5, 7):
         return _with_free_scale(source, target, params, kinds, pairs, control, unscaled)
@@ -194,21 +198,21 @@ def _with_free_scale(
     clock.lap("scale")
     why = refusal(found)
     if why is not None:
-        return without_scale(why, found, source, target, params, clock)
+        return _without_scale(why, found, source, target, params, clock)
     result = _at_scale(*in_metres(found, source, target), found, params, kinds, pairs, control)
     return replace(result, seconds={**clock.seconds, **result.seconds})
 
 
-def without_scale(
+def _without_scale(
     why: str,
     found: ScaleSearch,
     source: Cloud,
     target: Cloud,
     params: Register,
-    clock: Laps | None = None,
+    clock: Laps,
 ) -> Registration:
     """Return the answer where no scale could be found."""
-    none = in_file_coordinates(refused(why), source, target, 1.0, params, clock or Laps(), [])
+    none = in_file_coordinates(refused(why), source, target, 1.0, params, clock, [])
     dof = 5 if params.dof in (4, 5) else 7
     return replace(none, dof=dof, scale_search=scale_document(found, source, target))
 

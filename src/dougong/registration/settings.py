@@ -28,7 +28,7 @@ class Register(Parameters):
     """How the best pose is refined."""
     dof: Literal["auto", 4, 5, 6, 7] = "auto"
     """Degrees of freedom: 4 levelled, 5 levelled with scale, 6 rigid, 7 rigid with scale; auto: 6
-    with a gravity prior."""
+    with a gravity prior, and 7 where nothing declares a cloud's unit and it is not the metre."""
     filtered: bool = False
     """The inputs are clean already: nothing is dropped before the search."""
     yaw_hint_deg: Annotated[float, Field(ge=-360, le=360)] | None = None

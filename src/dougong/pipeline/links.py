@@ -1,0 +1,94 @@
+"""How each mover of a project gets into the frame of the reference."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dougong.cloud import Cloud
+from dougong.pipeline.control import (
+    control_of,
+)
+from dougong.pipeline.distances import (
+    Measured,
+    measure,
+)
+from dougong.pipeline.loading import Mover
+from dougong.pipeline.progress import Progress
+from dougong.pipeline.registering import register
+from dougong.registration import Register
+from dougong.registration.control_solve import ControlPoints
+from dougong.registration.result import Registration
+from dougong.typing import Transform
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Linked:
+    """A mover and how it got into the reference's frame (None: it is the reference)."""
+
+    mover: Mover
+    result: Registration | None
+    accepts_best: bool = False
+    """The user takes the best pose of an ambiguous registration."""
+    measured: Measured | None = None
+    """What its registration leaves between it and the reference; None: not sure, or nothing."""
+
+    @property
+    def is_sure(self) -> bool:
+        """True: its points belong into the merged cloud."""
+        if self.result is None or self.result.status == "ok":
+            return True
+        return self.accepts_best and self.result.matrix is not None
+
+    @property
+    def matrix(self) -> Transform | None:
+        """(4, 4) from its file coordinates to the reference's; None where that is not sure."""
+        if self.result is None:
+            return np.eye(4)
+        return self.result.matrix if self.is_sure else None
+
+    def in_reference(self, clouds: list[Cloud], reference: Cloud) -> list[Cloud]:
+        """Return its `clouds` in the reference's frame; where that is not known, in their own."""
+        if self.result is None or self.matrix is None:
+            return clouds
+        return [cloud.moved(self.matrix, reference.frame) for cloud in clouds]
+
+
+def register_all(
+    movers: Sequence[Mover],
+    reference: Mover,
+    params: Register,
+    control: Mapping[str, ControlPoints],
+    progress: Progress,
+) -> list[Linked]:
+    """Register every mover onto the reference."""
+    target = reference.joined()
+    params = params.model_copy(update={"filtered": True})
+    linked = []
+    for mover in movers:
+        if mover is reference:
+            linked.append(Linked(mover=mover, result=None))
+            continue
+        progress.stage(f"registering {mover.name} onto {reference.name}")
+        result = register(
+            mover.joined(),
+            target,
+            params,
+            source_kind=mover.kind,
+            target_kind=reference.kind,
+            control=control_of(control, mover.name, mover.entry),
+            scale=mover.scale,
+            is_declared=True,
+        )
+        progress.note(f"{mover.name} -> {reference.name}: {result.status}. {result.reason}")
+        linked.append(Linked(mover=mover, result=result, accepts_best=params.accept_best))
+    return linked
+
+
+def measured_link(link: Linked, reference: Mover, progress: Progress) -> Linked:
+    """Return a sure link with the distances that its registration leaves."""
+    if link.result is None or not link.is_sure:
+        return link
+    progress.stage(f"measuring {link.mover.name} against {reference.name}")
+    found = measure(link.mover.joined(), reference.joined(), link.result)
+    return replace(link, measured=found)
