@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from dougong.errors import InputError
+from dougong.registration.checks import checks_document
+from dougong.registration.control import Control
+from dougong.registration.control_solve import ControlPoints
 from dougong.report import build
 from dougong.report.drawing import View, draw_dots, draw_surface, height_colours, oblique_view
 from dougong.report.figures import find_place, overview, slices
@@ -391,3 +394,50 @@ def test_a_cloud_in_millimetres_beside_one_in_metres_is_reported_all_the_same(la
     titles = [figure.title for figure in overview([tiny_unit, second], find_place([second]))]
     assert "Before" not in titles
     assert "Height" in titles
+
+
+def certificate(checks, **changes):
+    """Return the words of the printed certificate of one registration with such `checks`."""
+    html = render(from_registration(registration(checks=checks, **changes)), [])
+    part = re.search(r'<section class="certificate".*?</section>', html, re.S)[0]
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", part)), html
+
+
+def surveyed(checks, count=20):
+    """Return the checks of points 5 mm off, one of the control points bad."""
+    rng = np.random.default_rng(4)
+    target = rng.uniform(-20, 20, (count, 3))
+    source = target + rng.normal(0, 0.005, target.shape)
+    source[2] += 0.4
+    points = ControlPoints(
+        names=tuple(f"P{k}" for k in range(count)),
+        source=source,
+        target=target,
+        sigma_m=np.full(count, 0.005),
+        is_check=np.arange(count) >= count - checks,
+    )
+    used = ~points.is_check
+    used[2] = False
+    control = Control(points=points, used=used, T_target_source=None)
+    return checks_document(control, None, np.eye(4))
+
+
+def test_the_certificate_names_the_check_error_the_grade_and_the_bad_point():
+    words, html = certificate(surveyed(checks=8))
+    assert "check RMSE (8 held-out points)" in words
+    assert "left out" in re.search(r"P2 .{0,60}", words)[0]
+    assert "8 points with the largest residuals of 20" in words
+    assert re.search(r"LOA\d0 \(USIBD\)", html)
+
+
+def test_the_certificate_states_no_grade_without_check_points():
+    words, html = certificate(surveyed(checks=0))
+    assert "none is stated: no check points were held out" in words
+    assert not re.search(r"LOA\d0 \(USIBD\)", html)
+
+
+def test_the_certificate_says_what_a_searched_scale_is_worth():
+    search = {"cloud": "drone", "metres_per_unit": 0.37, "sigma_ln": 7e-5, "control_points": 0}
+    words, _ = certificate(None, scale_search=search)
+    assert "searched: one unit of drone is 0.37 m (sigma 0.007 %)" in words
+    assert "not observable (scan) the turn about the vertical" in words

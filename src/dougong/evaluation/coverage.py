@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from dougong.registration.icp import Icp, refine
 from dougong.registration.prepare import Prepared
-from dougong.registration.result import FineResult
-from dougong.typing import Points, Values
+from dougong.registration.similarity_fit import fit_similarity
+from dougong.typing import Points, Transform, Values
 
 _LEVEL = 0.95
 _WAVES = 60
@@ -31,7 +32,8 @@ class Coverage:
     runs: int
     covered: int
     chi2_per_dof: Values
-    """(runs,) squared error in units of the covariance, over six; 1 on average where honest."""
+    """(runs,) squared error in units of the covariance, over the unknowns; 1 on average where
+    honest."""
 
     @property
     def share(self) -> float:
@@ -46,6 +48,7 @@ def coverage(
     field_m: float = 0.006,
     length_m: float = 1.5,
     points: int = 9000,
+    dof: Literal[6, 7] = 6,
     icp: Icp | None = None,
 ) -> Coverage:
     """Fit pairs of one hall whose true pose is the identity, and count.
@@ -60,6 +63,8 @@ def coverage(
         Correlation length of the field: at this distance exp(-1/2) is left.
     points : int
         Of each cloud.
+    dof : {6, 7}
+        Unknowns of the fit; 7: with the source's scale.
     icp : Icp, optional
     """
     icp = icp or Icp(points_per_level=4000, levels=2)
@@ -67,21 +72,30 @@ def coverage(
     for seed in seeds:
         rng = np.random.default_rng(seed)
         one, two = (_cloud(rng, points, white_m, field_m, length_m) for _ in range(2))
-        squares.append(_square(refine(one, two, np.eye(4), icp)))
+        if dof == 7:
+            fit = fit_similarity(one, two, np.eye(4), "source", icp, 7)
+            assert fit is not None
+            T, covariance, centre = fit.T_target_source.copy(), fit.covariance, fit.centre
+            T[:3, :3] *= fit.factor
+        else:
+            fine = refine(one, two, np.eye(4), icp)
+            T, covariance, centre = fine.T_target_source, fine.covariance, fine.covariance_about
+        assert covariance is not None
+        squares.append(_square(T, covariance, centre))
     values = np.array(squares)
-    bound = float(stats.chi2.ppf(_LEVEL, 6))
+    bound = float(stats.chi2.ppf(_LEVEL, dof))
     return Coverage(
-        runs=len(values), covered=int((values <= bound).sum()), chi2_per_dof=values / 6.0
+        runs=len(values), covered=int((values <= bound).sum()), chi2_per_dof=values / dof
     )
 
 
-def _square(fine: FineResult) -> float:
+def _square(T: Transform, covariance: NDArray[np.float64], centre: NDArray[np.float64]) -> float:
     """Return the squared error of a pose, whose truth is the identity, by its own covariance."""
-    assert fine.covariance is not None
-    T, c = fine.T_target_source, fine.covariance_about
-    turn = Rotation.from_matrix(T[:3, :3]).as_rotvec()
-    error = np.concatenate([turn, T[:3, :3] @ c + T[:3, 3] - c])
-    return float(error @ np.linalg.solve(fine.covariance, error))
+    growth = float(np.cbrt(np.linalg.det(T[:3, :3])))
+    turn = Rotation.from_matrix(T[:3, :3] / growth).as_rotvec()
+    shift = T[:3, :3] @ centre + T[:3, 3] - centre
+    error = np.concatenate([turn, shift, [np.log(growth)]])[: len(covariance)]
+    return float(error @ np.linalg.solve(covariance, error))
 
 
 def _cloud(

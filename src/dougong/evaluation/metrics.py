@@ -70,6 +70,18 @@ def fit_rigid(source: Points, target: Points, scale: float = 1.0) -> Transform:
     return matrix
 
 
+def best_scale(truth: Truth) -> float:
+    """Return lengths in the bent map / lengths in the scan, of the similarity nearest to both.
+
+    Umeyama (1991) over the surface that both sensors saw: a drone cloud's slow bending has a
+    scale of its own, which is the true one for whoever fits a scale.
+    """
+    source = truth.surface_points - truth.surface_points.mean(axis=0)
+    target = truth.surface_bent - truth.surface_bent.mean(axis=0)
+    rotation = fit_rigid(source, target)[:3, :3]
+    return float(np.einsum("ij,ij->", target, source @ rotation.T) / np.square(source).sum())
+
+
 def rotation_angle_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
     """Return the angle between two rotations (3, 3), exact for tiny angles too."""
     # The chord |R1 - R2| = 2 sqrt(2) sin(angle / 2) keeps digits that the arc cosine loses.

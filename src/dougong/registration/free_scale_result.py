@@ -21,7 +21,8 @@ def refusal(found: ScaleSearch) -> str | None:
     if not found.candidates:
         return (
             f"no scale between {LEAST:g} and {MOST:g} metres per unit brings the two clouds "
-            "together: they have nothing in common that the search can see."
+            "together: what they share holds no scale (one wall grows into itself), or they share "
+            "nothing that the search can see. Control points or a known length would give it."
         )
     best = found.candidates[0]
     if not best.fit.holds_scale or best.fit.covariance is None:

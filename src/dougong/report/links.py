@@ -8,6 +8,9 @@ import numpy as np
 
 from dougong.report.verdict import TONES, WORDS, Tone, millimetres, sentence
 
+_SHOWN_POINTS = 8
+"""Control and check points that the certificate's one page has room for."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Link:
@@ -27,6 +30,12 @@ class Link:
     history_mm: tuple[float, ...]
     points: tuple[Mapping[str, Any], ...]
     """Control and check points: name, role, residual in millimetres, remark."""
+    shown_points: tuple[Mapping[str, Any], ...]
+    """Those that a page has room for: bad ones first, then the worst."""
+    accuracy: tuple[tuple[str, str], ...]
+    """The check points' error, name and value, or why there is none; empty without any points."""
+    scale: str
+    """A scale that was searched, with its standard deviation; empty where it was known."""
 
 
 def link(document: Mapping[str, Any]) -> Link:
@@ -47,7 +56,40 @@ def link(document: Mapping[str, Any]) -> Link:
         unobservable=tuple(direction["text"] for direction in document["unobservable"]),
         history_mm=tuple(1000 * value for value in history if value is not None),
         points=tuple(_points(document.get("checks"))),
+        shown_points=tuple(_points(_worst(document.get("checks")))),
+        accuracy=tuple(_accuracy(document.get("checks"))),
+        scale=_searched(document),
     )
+
+
+def _worst(checks: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """Return the checks with the points that matter most: bad ones, then the largest residuals."""
+    if checks is None or len(checks["points"]) <= _SHOWN_POINTS:
+        return checks
+    ranked = sorted(
+        checks["points"],
+        key=lambda p: (p["name"] not in checks["bad"], -(p["residual_m"] or 0.0)),
+    )
+    chosen = {point["name"] for point in ranked[:_SHOWN_POINTS]}
+    return {**checks, "points": [p for p in checks["points"] if p["name"] in chosen]}
+
+
+def _accuracy(checks: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """Return the check points' error, or why there is no grade."""
+    if checks is None:
+        return []
+    check = checks["check"]
+    if check is None:
+        return [("level of accuracy", f"none is stated: {checks['why_no_level']}")]
+    points = f"{check['points']} held-out point{'s' if check['points'] != 1 else ''}"
+    return [
+        (
+            f"check RMSE ({points})",
+            f"{millimetres(check['check_rmse_m'])} in three dimensions, "
+            f"{millimetres(check['check_rmse_plan_m'])} in plan, "
+            f"{millimetres(check['check_rmse_height_m'])} in height",
+        ),
+    ]
 
 
 def _points(checks: Mapping[str, Any] | None) -> list[dict[str, str]]:
@@ -60,6 +102,11 @@ def _points(checks: Mapping[str, Any] | None) -> list[dict[str, str]]:
             "role": point["role"],
             "residual": millimetres(point["residual_m"]),
             "sigma": millimetres(point["sigma_m"]),
+            "short": (
+                "left out"
+                if point["role"] == "control" and not point["is_used"]
+                else str(point["role"])
+            ),
             "remark": (
                 "held out"
                 if point["role"] == "check"
@@ -106,13 +153,10 @@ def _facts(document: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _scale(document: Mapping[str, Any]) -> str:
     """Return the scale of the matrix and what fixes it; documents before 0.2 do not say it."""
-    scale = f"{document['scale']:.9g}"
-    search, grid = document.get("scale_search"), document.get("grid")
-    if search and search["sigma_ln"] is not None:
-        scale += (
-            f", searched: one unit of {search['cloud']} is {search['metres_per_unit']:.6g} m "
-            f"(sigma {100 * search['sigma_ln']:.2g} %)"
-        )
+    scale, grid = f"{document['scale']:.9g}", document.get("grid")
+    searched = _searched(document)
+    if searched:
+        scale += f", {searched}"
     if grid:
         scale += (
             f", known from the map projection ({grid['ppm']:+.1f} ppm in plan, "
@@ -120,6 +164,19 @@ def _scale(document: Mapping[str, Any]) -> str:
             f"off by at most {1000 * grid['height_error_m']:.1f} mm for it)"
         )
     return scale
+
+
+def _searched(document: Mapping[str, Any]) -> str:
+    """Return a searched scale in words; empty where none was searched, or none was found."""
+    search = document.get("scale_search")
+    if not search or search["sigma_ln"] is None or document["status"] == "failed":
+        return ""
+    by = search.get("control_points", 0)
+    how = f"from the clouds and {by} control point{'s' if by != 1 else ''}" if by else "searched"
+    return (
+        f"{how}: one unit of {search['cloud']} is {search['metres_per_unit']:.6g} m "
+        f"(sigma {100 * search['sigma_ln']:.2g} %)"
+    )
 
 
 def _overlap(fine: Mapping[str, Any], bound: str) -> str:
