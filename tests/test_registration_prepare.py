@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dougong.cloud import Cloud
 from dougong.errors import RegistrationError
@@ -155,3 +156,37 @@ def test_far_and_isolated_points_are_told_apart():
     points = np.vstack([surface, [[10.0, 10.0, 5.0]], [[5000.0, 0.0, 0.0]]])
     assert np.flatnonzero(far_points(points)).tolist() == [20_001]
     assert np.flatnonzero(isolated_points(points[:-1])).tolist() == [20_000]
+
+
+def round_walls(batter_deg, tilt_deg=0.0, slope=0.0):
+    """Return a round building's outer and inner wall, leaning to its middle: points, normals."""
+    rng = np.random.default_rng(0)
+    turn, height = rng.uniform(0, 2 * np.pi, 20_000), rng.uniform(0, 11, 20_000)
+    side = np.where(rng.random(20_000) < 0.7, 1.0, -1.0)
+    lean = np.radians(batter_deg)
+    radius = np.where(side > 0, 25.0, 20.0) - side * height * np.tan(lean)
+    out = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(20_000)])
+    points = radius[:, None] * out + height[:, None] * [0, 0, 1]
+    normals = side[:, None] * out * np.cos(lean) + [0, 0, np.sin(lean)]
+    T = np.array(Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix())
+    floor = np.tile([0.0, np.sin(slope), np.cos(slope)], (4000, 1))
+    ground = np.column_stack([rng.uniform(-30, 30, (4000, 2)), np.zeros(4000)])
+    return np.vstack([points, ground]) @ T.T, np.vstack([normals, floor]) @ T.T
+
+
+def test_a_battered_round_building_is_no_tilted_instrument():
+    # The ground falls by 2 degrees: it cannot tell which of the two it is.
+    points, normals = round_walls(2.5, slope=-0.035)
+    turn = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360.0
+    # Some of the wall was not seen.
+    seen = (turn > 40.0) | (normals[:, 2] > 0.9)
+    found = levelling(points[seen], normals[seen], np.full(int(seen.sum()), 0.1))
+    assert not found.is_tilted(0.6), found
+    assert found.battered > 0.8
+
+
+def test_an_upright_round_building_shows_a_tilted_instrument():
+    points, normals = round_walls(0.0, tilt_deg=3.0)
+    found = levelling(points, normals, np.full(len(points), 0.1))
+    assert found.is_tilted(0.6), found
+    assert found.tilt_deg == pytest.approx(3.0, abs=0.1)

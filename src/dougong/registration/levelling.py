@@ -29,6 +29,11 @@ class Levelling:
     """Standard deviation of the tilt in its weakest direction; inf: the walls cannot tell."""
     faces: int = 0
     """Wall faces that voted."""
+    support: float = 0.0
+    """Share of the wall area that is upright by `up`, from the weights of the robust fit, 0..1."""
+    battered: float = 0.0
+    """Share of it that leans by one angle to both sides of z, as the walls of a battered building
+    or a rampart do all round, 0..1."""
     ground_agrees: bool = True
     """The level surfaces, too, are squarer to `up` than to z. False: leaning (battered) walls on
     level ground, which say nothing about the instrument."""
@@ -39,7 +44,12 @@ class Levelling:
 
     def is_tilted(self, tolerance_deg: float) -> bool:
         """Say whether the walls prove a tilt of more than `tolerance_deg` (4 sigma)."""
-        return self.ground_agrees and self.tilt_deg - 4.0 * self.sigma_deg > tolerance_deg
+        is_explained_by_batter = self.battered >= self.support
+        return (
+            self.ground_agrees
+            and not is_explained_by_batter
+            and self.tilt_deg - 4.0 * self.sigma_deg > tolerance_deg
+        )
 
 
 def levelling(points: Points, normals: Points, weights: Values) -> Levelling:
@@ -127,8 +137,35 @@ def _summary(
         tilt_deg=float(np.degrees(np.arctan(np.hypot(*slope)))),
         sigma_deg=float(np.degrees(sigma)),
         faces=len(faces),
+        support=1.0 - rejected,
+        battered=_battered_share(faces, areas),
         ground_agrees=bool(up @ level >= level[2]),
     )
+
+
+def _battered_share(faces: Points, areas: Values) -> float:
+    """Return the share of wall area that leans by one angle to both sides of z, 0..1.
+
+    Normals of opposite walls count as one direction here: a tilted instrument leans them to the
+    same side of it, a battered building to both. So an angle's share counts, per direction, twice
+    the smaller of both sides. Otherwise a fit that stands a quarter of a round building's walls
+    upright would pass for a tilt of the instrument.
+    """
+    lean = np.degrees(np.arctan(faces[:, 2]))
+    angle = np.mod(np.arctan2(faces[:, 1], faces[:, 0]), np.pi)
+    direction = np.minimum((angle / (np.pi / 6)).astype(np.int64), 5)
+    best = 0.0
+    for batter in np.arange(0.5 * _TUKEY_DEG, 10.0, 0.25 * _TUKEY_DEG):
+        near = [
+            np.bincount(
+                direction,
+                areas * np.clip(1.0 - ((side * lean - batter) / _TUKEY_DEG) ** 2, 0.0, None) ** 2,
+                6,
+            )
+            for side in (1.0, -1.0)
+        ]
+        best = max(best, float(2.0 * np.minimum(*near).sum()))
+    return best / float(areas.sum())
 
 
 def _level_normal(normals: Points, weights: Values) -> NDArray[np.float64]:
