@@ -11,7 +11,7 @@ from dougong.cli._shell import Answer, Listener, execute
 
 
 def command(
-    study: Literal["denoise"],
+    study: Literal["denoise", "probability", "hard"],
     /,
     *,
     out: Path | None = None,
@@ -30,7 +30,8 @@ def command(
     Parameters
     ----------
     study
-        denoise: noise filters, noise removed against carving kept.
+        denoise: noise filters, noise removed against carving kept. probability: the verdict's
+        probability against how often it is right. hard: hard and impossible pairs.
     out
         Folder for the files; default: dougong-STUDY in the current folder.
     quick

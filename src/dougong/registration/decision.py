@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ from dougong.registration.icp import Icp, build_levels, refine
 from dougong.registration.laps import Laps
 from dougong.registration.overlap import apply
 from dougong.registration.prepare import Prepared
+from dougong.registration.probability import FITTED, Evidence
 from dougong.registration.result import FineResult, Hypothesis
 from dougong.registration.rivals import is_same, middle_of
 from dougong.registration.roof_sides import height_left_open, weigh_height
@@ -39,6 +40,8 @@ class Found:
     hypotheses: tuple[Hypothesis, ...]
     margin: float
     ruling: Ruling | None
+    evidence: Evidence | None = None
+    """What `probability` was worked out from; None: no pose was judged."""
     adjusted: Adjusted | None = None
     """With the control points; None: there are none, or they changed nothing."""
 
@@ -76,10 +79,14 @@ def decide(
     fine, adjusted = _refined(source, target, ruling, params, control)
     T = ruling.winner.T if fine is None else fine.T_target_source
     clock.lap("fine")
-    status, reason = _judged(court, ruling, fine, params)
+    status, reason, spread = _judged(court, ruling, fine, params)
+    evidence = _evidence(ruling, spread)
     if status == "ok" and fine is not None and adjusted is None:
         left_open = height_left_open(court, source, target, T)
         status, reason = weigh_height(reason, left_open)
+        if status != "ok":
+            # The other side of the roof is one more pose that fits as well.
+            evidence = replace(evidence, rivals=(*evidence.rivals, 1.0))
     if status == "ok":
         hand = handedness(court, levels, ruling.winner, quick, params.verdict)
         if hand == "left":
@@ -93,12 +100,32 @@ def decide(
         reason=reason,
         T=None if status == "failed" else T,
         fine=fine,
-        probability=0.0 if status == "failed" else ruling.probability,
+        probability=_probability(status, ruling, evidence),
         hypotheses=listed,
         margin=_margin(listed),
         ruling=ruling,
+        evidence=evidence,
         adjusted=adjusted,
     )
+
+
+def _evidence(ruling: Ruling, spread_m: float) -> Evidence:
+    return Evidence(
+        sharpness=ruling.sharpness,
+        explained=ruling.explained,
+        violation=ruling.violation,
+        spread_m=spread_m,
+        rivals=tuple(
+            1.0 if c.fits_as_well else c.p_value for c in (*ruling.undecided, *ruling.beaten)
+        ),
+    )
+
+
+def _probability(status: str, ruling: Ruling, evidence: Evidence) -> float:
+    """Return the probability of the pose; 0 where it is refused or what is known contradicts it."""
+    if status == "failed" or ruling.overruled is not None:
+        return 0.0
+    return FITTED.probability(evidence)
 
 
 def _icp(params: Register) -> Icp:
@@ -153,37 +180,40 @@ def _quick(icp: Icp, source: Prepared, target: Prepared) -> Icp:
 
 def _judged(
     court: Court, ruling: Ruling, fine: FineResult | None, params: Register
-) -> tuple[Literal["ok", "ambiguous", "failed"], str]:
+) -> tuple[Literal["ok", "ambiguous", "failed"], str, float]:
+    """Return status, reason, and how closely the blocks hold the pose, metres (inf: unknown)."""
     status, reason = status_of(ruling, fine, params.verdict)
     if fine is None or status == "failed":
-        return status, reason
+        return status, reason, np.inf
     final = hear(court, fine.T_target_source)
     if not is_same(final.T, ruling.winner.T, middle_of(court.source.points)):
-        return "ambiguous", (
+        why = (
             "the fine fit left the pose that was judged best: the surface near it holds it "
             "too weakly. Control points or more overlap would decide."
         )
-    if status == "ok" and fine.covariance is not None:
-        explained = final.is_explained[: len(court.source.points)]
-        shared = apply(final.T, court.source.points[explained])
-        spread = displacement95(
-            fine.covariance,
-            fine.covariance_about,
-            shared,
-            fine.covariance_blocks,
-            fine.covariance_of_control,
+        return "ambiguous", why, np.inf
+    if fine.covariance is None:
+        return status, reason, np.inf
+    explained = final.is_explained[: len(court.source.points)]
+    spread = displacement95(
+        fine.covariance,
+        fine.covariance_about,
+        apply(final.T, court.source.points[explained]),
+        fine.covariance_blocks,
+        fine.covariance_of_control,
+    )
+    if status != "ok":
+        return status, reason, spread
+    limit = params.verdict.most_spread_m
+    if spread > limit:
+        why = (
+            f"the parts of the shared surface disagree about the pose by {spread:.2g} m "
+            f"(95 %; at most {limit:.2g} m expected): it is held too weakly, or one cloud is "
+            "bent. Control points or more overlap would decide."
         )
-        limit = params.verdict.most_spread_m
-        if spread > limit:
-            return "ambiguous", (
-                f"the parts of the shared surface disagree about the pose by {spread:.2g} m "
-                f"(95 %; at most {limit:.2g} m expected): it is held too weakly, or one cloud is "
-                "bent. Control points or more overlap would decide."
-            )
-        reason += (
-            f" The parts of the shared surface agree about it to {1e3 * spread:.0f} mm (95 %)."
-        )
-    return status, reason
+        return "ambiguous", why, spread
+    agree = f"The parts of the shared surface agree about it to {1e3 * spread:.0f} mm (95 %)."
+    return status, f"{reason} {agree}", spread
 
 
 def _is_near_yaw(T: Transform, hint_deg: float, reach_deg: float) -> bool:

@@ -52,15 +52,19 @@ class _Plan:
     low: NDArray[np.float64]
     cell_m: float
     covered: NDArray[np.bool_]
+    """Cells with points in them or beside them."""
+    within: NDArray[np.bool_]
+    """Cells whose neighbours are all covered by points: a cell's width and more from the edge."""
     top: NDArray[np.float64]
 
-    def at(self, points: Points) -> tuple[Mask, Values]:
-        """Return is_inside and the top (-inf outside) for `points` (n, 3)."""
+    def at(self, points: Points) -> tuple[Mask, Mask, Values]:
+        """Return is_inside, is_within and the top (-inf outside) for `points` (n, 3)."""
         place = np.floor((points[:, :2] - self.low) / self.cell_m)
         is_on: Mask = np.all((place >= 0) & (place < self.covered.shape), axis=1)
         i, j = np.where(is_on[:, None], place, 0.0).astype(np.int64).T
         is_inside: Mask = is_on & self.covered[i, j]
-        return is_inside, np.where(is_on, self.top[i, j], -np.inf)
+        is_within: Mask = is_on & self.within[i, j]
+        return is_inside, is_within, np.where(is_on, self.top[i, j], -np.inf)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,6 +118,8 @@ class Testimony:
     """(m,) the other cloud shows something near."""
     is_inside: Mask
     """(m,) inside the other cloud's plan."""
+    is_within: Mask
+    """(m,) inside it and not at its edge."""
     total: float
     """Weighted mean loss."""
 
@@ -158,18 +164,26 @@ def _plan(prepared: Prepared) -> _Plan:
     size = ij.max(axis=0) + 3
     top = np.full(tuple(size), -np.inf)
     np.maximum.at(top, (ij[:, 0], ij[:, 1]), prepared.xyz[:, 2])
-    wide = top.copy()
+    wide = _widest(top)
+    covered = np.isfinite(wide)
+    # Gaps of a cell are closed, then the border is taken off twice: once what closing added.
+    within = ~np.isfinite(_widest(_widest(np.where(covered, -np.inf, 0.0))))
+    return _Plan(low=low, cell_m=cell, covered=covered, within=within, top=wide)
+
+
+def _widest(raster: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the highest value (nx, ny) of every cell and its eight neighbours."""
+    wide = raster.copy()
     for axis in (0, 1):
         wide = np.maximum(wide, np.maximum(np.roll(wide, 1, axis), np.roll(wide, -1, axis)))
-    # Only whole surfaces: a cell counts as covered where its surroundings are.
-    return _Plan(low=low, cell_m=cell, covered=np.isfinite(wide), top=wide)
+    return wide
 
 
 def hear(court: Court, T: Transform) -> Testimony:
     """Return what both clouds' points say about `T` (source -> target)."""
     one = _hear_one(court.source, court.target, T, court.tolerance_m)
     two = _hear_one(court.target, court.source, inverse(T), court.tolerance_m)
-    loss, explained, comparable, inside = (
+    loss, explained, comparable, inside, within = (
         np.concatenate([a, b]) for a, b in zip(one, two, strict=True)
     )
     weights = court.weights
@@ -179,13 +193,14 @@ def hear(court: Court, T: Transform) -> Testimony:
         is_explained=explained,
         is_comparable=comparable,
         is_inside=inside,
+        is_within=within,
         total=float(weights @ loss / max(float(weights.sum()), 1e-300)),
     )
 
 
 def _hear_one(
     from_: Witness, to: Witness, T: Transform, tolerance_m: float
-) -> tuple[Values, Mask, Mask, Mask]:
+) -> tuple[Values, Mask, Mask, Mask, Mask]:
     moved = apply(T, from_.points)
     normals = from_.normals @ T[:3, :3].T
     reach = tolerance_m + _RAMP_M
@@ -211,12 +226,12 @@ def _hear_one(
     is_oriented = from_.is_oriented & to.everything.is_oriented[index]
     is_alike = do_agree(normals, other, is_oriented, _NORMAL_COSINE)
     error = np.where(is_near & is_alike, error, np.inf)
-    is_inside, top = to.plan.at(moved)
+    is_inside, is_within, top = to.plan.at(moved)
     loss = np.where(is_inside, np.clip((error - tolerance_m) / _RAMP_M, 0.0, 1.0), _OUTSIDE)
     if to.sees_tops:
         loss[is_inside & (moved[:, 2] > top + _ABOVE_TOP_M)] = _VIOLATION
     is_explained = is_inside & (error <= tolerance_m)
-    return loss, is_explained, is_near & is_inside, is_inside
+    return loss, is_explained, is_near & is_inside, is_inside, is_within
 
 
 def structure_weights(court: Court) -> Values:

@@ -8,7 +8,7 @@ not evidence: a round building turned by 180 degrees fits almost as well.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,7 +17,15 @@ from pydantic import Field
 
 from dougong.params import Parameters
 from dougong.registration.covariance import blocks_of
-from dougong.registration.evidence import Court, Testimony, hear, sharpness, support, violation
+from dougong.registration.evidence import (
+    Court,
+    Testimony,
+    hear,
+    sharpness,
+    structure_weights,
+    support,
+    violation,
+)
 from dougong.registration.icp import Icp, Level, refine_levels
 from dougong.registration.overlap import apply, inverse
 from dougong.registration.randomisation import sign_flip, student
@@ -30,11 +38,13 @@ from dougong.registration.rivals import (
     propose_rivals,
 )
 from dougong.registration.symmetry import in_words, move_between
-from dougong.typing import Transform, Values
+from dougong.typing import Mask, Transform, Values
 
 _TWIN_M = 0.1
 """Fits that end farther apart than this (95 % of the structure) rest in different places: twice
 what is correct, and more than an unfinished fit lacks."""
+_SHARED = 0.5
+"""A pose that shares this much of a cloud's structure is no laying of one wall on another."""
 
 
 class Verdict(Parameters):
@@ -79,6 +89,9 @@ class Comparison:
     p_value: float
     """Chance of so much evidence for the winner if blocks did not prefer either."""
     blocks: int
+    fits_as_well: bool = False
+    """The rival explains what the clouds share under it as well as the winner does, so that it
+    loses only by sharing less; see `fits_as_well`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,26 +108,32 @@ class Ruling:
     """Share of the structure that both clouds show near each other, see `support`."""
     sharpness: float
     violation: float
-    probability: float
     overruled: Comparison | None = None
     """How the winner compares with a pose that is not allowed (by a hint, by control points) and
     that the clouds prefer beyond doubt; None: there is none."""
 
 
-def compare(court: Court, winner: Testimony, rival: Testimony, block_m: float) -> Comparison:
+def compare(
+    court: Court,
+    winner: Testimony,
+    rival: Testimony,
+    block_m: float,
+    domain: Mask | None = None,
+) -> Comparison:
     """Return the paired block comparison of two poses.
 
     Blocks lie in the source's frame; target points are put there by the winner's pose, so that
     what both clouds say about one place counts once. If the blocks preferred neither pose, each
     block's difference could as well have had the other sign (Fisher's randomisation test), or
     their mean were 0 (Student's t). The first tells many unequal blocks, the second a few alike;
-    the smaller chance counts, doubled because two were looked at.
+    the smaller chance counts, doubled because two were looked at. `domain` (m,): only these points
+    are heard.
     """
     back = apply(inverse(winner.T), court.target.points)
     places = np.concatenate([court.source.points, back])
     extent = np.ptp(places, axis=0).max()
     block, count = blocks_of(places, min(block_m, max(float(extent) / 8.0, 1e-6)))
-    weights = court.weights
+    weights = court.weights if domain is None else court.weights * domain
     difference = weights * (rival.loss - winner.loss)
     sums: Values = np.bincount(block, difference, count).astype(np.float64)
     mass = np.bincount(block, weights, count)
@@ -185,8 +204,17 @@ def rule(
         overruled = compare(court, best, winner, params.block_m)
         overruled = overruled if is_beaten(overruled, params) else None
     others = [pose for pose in poses[1:] if not is_same(pose.T, winner.T, at)]
-    results = [compare(court, winner, other, params.block_m) for other in (*others, *twins)]
-    is_told = [is_beaten(c, params, is_near(c.T, winner.T, at)) for c in results]
+    results = [
+        replace(
+            compare(court, winner, other, params.block_m),
+            fits_as_well=fits_as_well(court, winner, other, params),
+        )
+        for other in others
+    ]
+    results += [compare(court, winner, other, params.block_m) for other in twins]
+    is_told = [
+        not c.fits_as_well and is_beaten(c, params, is_near(c.T, winner.T, at)) for c in results
+    ]
     beaten = [c for c, told in zip(results, is_told, strict=True) if told]
     undecided = [c for c, told in zip(results, is_told, strict=True) if not told]
     explained, sharp = support(court, winner), sharpness(court, winner)
@@ -198,7 +226,6 @@ def rule(
         explained=explained,
         sharpness=sharp,
         violation=violation(court, winner),
-        probability=0.0 if overruled else _probability(undecided, beaten, sharp, params),
         overruled=overruled,
     )
 
@@ -232,24 +259,42 @@ def is_beaten(comparison: Comparison, params: Verdict, is_close: bool = False) -
     return comparison.gain >= params.gain and comparison.p_value <= limit
 
 
+def fits_as_well(court: Court, winner: Testimony, rival: Testimony, params: Verdict) -> bool:
+    """Say whether a rival is contradicted no more than the winner by what both clouds show.
+
+    What lies outside the other cloud's plan counts against a pose in `compare`, else one could
+    win by moving the clouds apart. But unseen is not empty: where each cloud shows another end
+    of a building whose ends are alike, a pose that lays one end on the other shares more than
+    the true one and is wrong. So a rival that would pass for a pose of its own, and explains
+    what lies well within both clouds as well as the winner does, is not beaten by sharing less.
+    """
+    weights, split = structure_weights(court), len(court.source.points)
+    shared = [weights * pose.is_within for pose in (winner, rival)]
+    share = max(
+        float(shared[1][side].sum()) / max(float(weights[side].sum()), 1e-300)
+        for side in (slice(0, split), slice(split, None))
+    )
+    if share < params.least_overlap:
+        return False
+    loss = [
+        float(part @ pose.loss) / max(float(part.sum()), 1e-300)
+        for part, pose in zip(shared, (winner, rival), strict=True)
+    ]
+    if loss[1] > loss[0] + params.gain:
+        return False
+    common = compare(court, winner, rival, params.block_m, winner.is_within & rival.is_within)
+    if is_beaten(common, params, is_close=True):
+        return False
+    if support(court, rival) < params.least_explained:
+        return False
+    # Any wall can be laid on any other with the rest of the cloud outside: of a pose that shares
+    # little, as much is asked as of the winner.
+    is_held = share >= _SHARED or sharpness(court, rival) >= params.least_sharpness
+    return is_held and violation(court, rival) <= params.most_violation
+
+
 def _refined(court: Court, levels: tuple[Level, ...], T: Transform, icp: Icp) -> Testimony:
     return hear(court, refine_levels(levels, T, icp).T_target_source)
-
-
-def _probability(
-    undecided: Sequence[Comparison],
-    beaten: Sequence[Comparison],
-    sharp: float,
-    params: Verdict,
-) -> float:
-    """Return a cautious probability that the winner is right.
-
-    Undecided rivals share the belief equally; each beaten one keeps its p-value, never less than
-    1e-3; a pose that explains hardly more than its surroundings cannot be probable.
-    """
-    rest = 1.0 + len(undecided) + sum(max(c.p_value, 1e-3) for c in beaten)
-    trust = np.clip((sharp - 1.0) / (params.least_sharpness - 1.0), 0.0, 1.0)
-    return float(min(0.999, 1.0 / rest) * trust)
 
 
 def status_of(ruling: Ruling, fine: FineResult | None, params: Verdict) -> tuple[Status, str]:

@@ -6,8 +6,9 @@ and its name in ``cli/evaluate.py``, and ``dougong evaluate NAME`` runs it.
 
 import csv
 import io
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from dougong.pipeline.registrations import finite
 
 STUDIES: Mapping[str, str] = {
     "denoise": "noise filters: noise removed against carving kept",
+    "probability": "the verdict's probability against how often it is right",
+    "hard": "hard and impossible pairs: right, ambiguous, failed, wrong",
 }
 """Every study by its name, with what it measures."""
 
@@ -36,6 +39,8 @@ class Setting:
     """Small samples and few runs: a look, not a measurement."""
     data: Path | None = None
     """Folder of real scans."""
+    kept: Path | None = None
+    """File in which a long study keeps its rows as they are measured; see `measured`."""
 
     def seeds(self, usual: int, quick: int) -> range:
         """Return the seeds of the runs."""
@@ -55,6 +60,47 @@ class Findings:
     """The table for a terminal."""
     draw: Callable[[Path], None]
     """Writes the figure as PNG."""
+
+
+def measured(
+    setting: Setting,
+    keys: Iterable[tuple[Any, ...]],
+    measure: Callable[..., Mapping[str, Any]],
+    progress: Progress,
+) -> list[Mapping[str, Any]]:
+    """Return `measure(*key)` of every key; a row that was kept by a stopped run is not made again.
+
+    Rows are kept one per line, with their key and the program's version, as soon as they are
+    measured. Rows of another version are made again.
+    """
+    version = software()
+    rows: dict[str, Mapping[str, Any]] = {}
+    if setting.kept is not None and setting.kept.is_file():
+        for text in setting.kept.read_text(encoding="utf-8").splitlines():
+            line = _line(text)
+            if line is not None and line["software"] == version:
+                rows[json.dumps(line["key"])] = line["row"]
+    chosen = []
+    for key in keys:
+        name = json.dumps(key)
+        if name not in rows:
+            progress.stage(", ".join(str(part) for part in key))
+            rows[name] = finite(dict(measure(*key)))
+            if setting.kept is not None:
+                line = {"key": key, "software": version, "row": rows[name]}
+                with setting.kept.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(line) + "\n")
+        chosen.append(rows[name])
+    return chosen
+
+
+def _line(text: str) -> dict[str, Any] | None:
+    """Return a kept line; None for the last one of a run that was stopped while writing it."""
+    try:
+        line: dict[str, Any] = json.loads(text)
+    except json.JSONDecodeError:
+        return None
+    return line
 
 
 def evaluate(
@@ -87,6 +133,10 @@ def evaluate(
     except OSError as error:
         msg = f"{out} cannot be made: {error.strerror or error}. Choose another --out."
         raise OutputError(msg) from error
+    kept = out / f"{name}.rows.jsonl"
+    if overwrite:
+        kept.unlink(missing_ok=True)
+    setting = replace(setting, kept=kept)
     found: Findings = import_module(f"dougong.evaluation.studies.{name}").study(setting, progress)
     document = finite(
         {
@@ -114,6 +164,7 @@ def evaluate(
             raise OutputError(msg) from error
         finally:
             part.unlink(missing_ok=True)
+    kept.unlink(missing_ok=True)
     return {**document, "files": [str(file) for file in files]}, found.text
 
 

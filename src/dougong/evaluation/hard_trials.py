@@ -167,7 +167,7 @@ def sloping(base: Base, rng: np.random.Generator) -> Trial:
     shear[2, :2] = 0.12, 0.09
     clouds = ("lidar", "drone", "surface", "bent")
     # T_best stays: bending shears along, by less than a millimetre.
-    changed = {name: moved(shear, getattr(base, name)) for name in clouds}
+    changed: dict[str, Any] = {name: moved(shear, getattr(base, name)) for name in clouds}
     return plain(replace(base, **changed), rng)
 
 

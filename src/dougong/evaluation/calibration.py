@@ -1,0 +1,156 @@
+"""Whether declared probabilities are those observed, on generated pairs whose truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from dougong.cloud import Cloud
+from dougong.errors import DougongError
+from dougong.evaluation.metrics import CORRECT_TRE95_M, pose_errors
+from dougong.evaluation.trial_pairs import TrialPair, make_pair
+from dougong.registration.decision import Found, decide
+from dougong.registration.icp import Icp
+from dougong.registration.plan_search import PlanSearch, plan_search
+from dougong.registration.prepare import Prepare, prepare
+from dougong.registration.probability import MOST_PROBABLE, Belief, Evidence, shares
+from dougong.registration.settings import Register
+from dougong.typing import Mask, Values
+
+Row = Mapping[str, Any]
+SETTINGS = Register(
+    prepare=Prepare(min_spacing_m=0.4), plan=PlanSearch(peaks=24), icp=Icp(points_per_level=2000)
+)
+"""Thinned: what fewer peaks and points lose, the verdict has to notice."""
+BINS = 15
+_RIDGE = 0.02
+"""Pull of the coefficients towards nothing, in pairs: keeps them finite on few pairs."""
+
+
+def measure(kind: str, seed: int, settings: Register = SETTINGS) -> dict[str, Any]:
+    """Register one pair and return what was said about it and what is true, plain."""
+    pair = make_pair(kind, seed)
+    row: dict[str, Any] = {"kind": kind, "seed": seed, "is_unique": pair.is_unique}
+    try:
+        found, tre95 = _registered(pair, settings)
+    except DougongError as error:
+        return {**row, "status": "failed", "reason": str(error), "is_correct": False}
+    row |= {"status": found.status, "reason": found.reason, "tre95_m": tre95}
+    row["is_correct"] = found.T is not None and tre95 is not None and tre95 <= CORRECT_TRE95_M
+    evidence = found.evidence
+    if found.T is None or evidence is None:
+        return row
+    return row | {
+        "probability": found.probability,
+        "sharpness": evidence.sharpness,
+        "explained": evidence.explained,
+        "violation": evidence.violation,
+        "spread_m": evidence.spread_m,
+        "rivals": list(evidence.rivals),
+    }
+
+
+def _registered(pair: TrialPair, settings: Register) -> tuple[Found, float | None]:
+    clouds = [Cloud.from_points(points) for points in (pair.source, pair.target)]
+    one = prepare(clouds[0], "lidar", settings.prepare)
+    two = prepare(clouds[1], "photogrammetry", settings.prepare)
+    found = decide(one, two, plan_search(one, two, settings.plan), settings)
+    if found.T is None or pair.truth is None:
+        return found, None
+    matrix = found.T.copy()
+    origins = [cloud.frame.origin for cloud in clouds]
+    matrix[:3, 3] += origins[1] - matrix[:3, :3] @ origins[0]
+    return found, pose_errors(matrix, pair.truth).tre95_m
+
+
+def evidence_of(row: Row) -> Evidence | None:
+    """Return the evidence a row was judged on; None: its pose was refused."""
+    if "probability" not in row:
+        return None
+    return Evidence(
+        sharpness=row["sharpness"],
+        explained=row["explained"],
+        violation=row["violation"],
+        spread_m=np.inf if row["spread_m"] is None else row["spread_m"],
+        rivals=tuple(row["rivals"]),
+    )
+
+
+def probabilities(rows: Sequence[Row], belief: Belief) -> Values:
+    """Return what `belief` says of every row: 0 where the pose was refused."""
+    found = (evidence_of(row) for row in rows)
+    return np.array([0.0 if e is None else belief.probability(e) for e in found])
+
+
+def fit(rows: Sequence[Row]) -> Belief:
+    """Return the belief under which what was observed is most likely.
+
+    Poses that were refused say nothing: their probability is 0 whatever the coefficients.
+    """
+    judged = [(e, bool(row["is_correct"])) for row in rows if (e := evidence_of(row)) is not None]
+    terms = np.array([evidence.terms() for evidence, _ in judged])
+    is_correct = np.array([correct for _, correct in judged])
+
+    def cost(numbers: NDArray[np.float64]) -> float:
+        trust = 1.0 / (1.0 + np.exp(-terms @ numbers[:-1]))
+        rivals = np.array([shares(evidence.rivals, numbers[-1]) for evidence, _ in judged])
+        p = np.clip(trust / (1.0 + rivals), 1.0 - MOST_PROBABLE, MOST_PROBABLE)
+        likely = np.where(is_correct, np.log(p), np.log1p(-p)).sum()
+        return float(-likely + _RIDGE * np.square(numbers[1:-1]).sum())
+
+    start = np.array([0.0, 1.0, 1.0, 1.0, 0.3, 0.5])
+    bounds = [(-20.0, 20.0), *[(0.0, 50.0)] * 4, (0.05, 3.0)]
+    best = optimize.minimize(cost, start, method="L-BFGS-B", bounds=bounds)
+    return Belief(trust=tuple(float(x) for x in best.x[:-1]), rival_power=float(best.x[-1]))
+
+
+def calibration_error(p: Values, is_correct: Mask, bins: int = BINS) -> float:
+    """Return the expected calibration error: the mean over pairs of |declared - observed|.
+
+    In `bins` equal steps of the declared probability.
+    """
+    return float(
+        sum(
+            b["share"] * abs(b["declared"] - b["observed"])
+            for b in reliability(p, is_correct, bins)
+        )
+    )
+
+
+def reliability(p: Values, is_correct: Mask, bins: int = BINS) -> list[dict[str, float]]:
+    """Return, for every bin that holds pairs, the declared and the observed frequency.
+
+    With the 95 % interval of the observed one (Clopper and Pearson 1934).
+    """
+    place = np.minimum((p * bins).astype(np.int64), bins - 1)
+    table = []
+    for k in np.unique(place):
+        chosen = is_correct[place == k]
+        count, hits = len(chosen), int(chosen.sum())
+        low = float(stats.beta.ppf(0.025, hits, count - hits + 1)) if hits else 0.0
+        high = float(stats.beta.ppf(0.975, hits + 1, count - hits)) if hits < count else 1.0
+        table.append(
+            {
+                "pairs": count,
+                "share": count / len(p),
+                "declared": float(p[place == k].mean()),
+                "observed": hits / count,
+                "low95": low,
+                "high95": high,
+            }
+        )
+    return table
+
+
+def area_under_roc(p: Values, is_correct: Mask) -> float:
+    """Return the chance that a true pose is declared more probable than a false one; ties half."""
+    true, false = p[is_correct], p[~is_correct]
+    if not len(true) or not len(false):
+        return float("nan")
+    ranks = stats.rankdata(np.concatenate([true, false]))
+    above = ranks[: len(true)].sum() - len(true) * (len(true) + 1) / 2
+    return float(above / (len(true) * len(false)))
