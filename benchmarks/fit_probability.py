@@ -3,7 +3,7 @@
     python benchmarks/fit_probability.py --seeds 0-59 --rows rows.jsonl
 
 Pairs of the kinds in `trial_pairs.TRAINED`; rows are kept in the file and not made again. Prints
-`FITTED` for ``registration/probability.py`` and the fit on its own pairs. What it is worth on
+`BELIEF` for ``registration/probability.py`` and the fit on its own pairs. What it is worth on
 others: ``dougong evaluate probability``. One pair takes about two CPU seconds.
 """
 
@@ -36,7 +36,7 @@ def main() -> None:
     keys = [(kind, seed) for seed in range(first, last + 1) for kind in TRAINED]
     rows = measured(Setting(kept=asked.rows), keys, measure, Silent())
     belief = fit(rows)
-    print(f"FITTED = {belief}")
+    print(f"BELIEF = {belief}")
     p = probabilities(rows, belief)
     is_correct = np.array([bool(row["is_correct"]) for row in rows])
     print(

@@ -15,7 +15,7 @@ from dougong.evaluation.calibration import (
 from dougong.evaluation.studies import Setting, measured
 from dougong.evaluation.trial_pairs import KINDS, TRAINED, make_pair
 from dougong.pipeline.progress import Silent
-from dougong.registration.probability import FITTED, MOST_PROBABLE, Belief, Evidence
+from dougong.registration.probability import BELIEF, MOST_PROBABLE, Belief, Evidence
 
 
 def evidence(**changes):
@@ -57,14 +57,14 @@ def test_ends_that_are_alike_are_not_taken_for_one_another():
     ],
 )  # fmt: skip
 def test_more_evidence_never_makes_a_pose_less_probable(better):
-    less, more = FITTED.probability(evidence()), FITTED.probability(evidence(**better))
+    less, more = BELIEF.probability(evidence()), BELIEF.probability(evidence(**better))
     assert 0.0 <= less <= more <= MOST_PROBABLE
-    assert FITTED.probability(evidence(violation=0.07)) <= less
+    assert BELIEF.probability(evidence(violation=0.07)) <= less
 
 
 def test_equal_rivals_share_the_belief():
-    alone = FITTED.probability(evidence(rivals=()))
-    assert FITTED.probability(evidence(rivals=(1.0, 1.0, 1.0))) == pytest.approx(
+    alone = BELIEF.probability(evidence(rivals=()))
+    assert BELIEF.probability(evidence(rivals=(1.0, 1.0, 1.0))) == pytest.approx(
         alone / 4.0, rel=0.01
     )
 

@@ -17,7 +17,7 @@ from dougong.registration.decision import Found, decide
 from dougong.registration.icp import Icp
 from dougong.registration.plan_search import PlanSearch, plan_search
 from dougong.registration.prepare import Prepare, prepare
-from dougong.registration.probability import MOST_PROBABLE, Belief, Evidence, shares
+from dougong.registration.probability import BELIEF, MOST_PROBABLE, Belief, Evidence, shares
 from dougong.registration.settings import Register
 from dougong.typing import Mask, Values
 
@@ -27,8 +27,10 @@ SETTINGS = Register(
 )
 """Thinned: what fewer peaks and points lose, the verdict has to notice."""
 BINS = 15
-_RIDGE = 0.02
-"""Pull of the coefficients towards nothing, in pairs: keeps them finite on few pairs."""
+_EXPECTED = np.array([*BELIEF.trust, BELIEF.rival_power])
+_DOUBT = np.array([2.0, 1.0, 2.0, 10.0, 0.5, 0.5])
+"""What the coefficients are taken to be, and to how much, before any pair is seen: a few pairs
+in which nothing failed would else make every pose certain. Thousands of pairs outweigh it."""
 
 
 def measure(kind: str, seed: int, settings: Register = SETTINGS) -> dict[str, Any]:
@@ -87,7 +89,7 @@ def probabilities(rows: Sequence[Row], belief: Belief) -> Values:
 
 
 def fit(rows: Sequence[Row]) -> Belief:
-    """Return the belief under which what was observed is most likely.
+    """Return the most likely belief, given what was observed and `_EXPECTED`.
 
     Poses that were refused say nothing: their probability is 0 whatever the coefficients.
     """
@@ -100,11 +102,10 @@ def fit(rows: Sequence[Row]) -> Belief:
         rivals = np.array([shares(evidence.rivals, numbers[-1]) for evidence, _ in judged])
         p = np.clip(trust / (1.0 + rivals), 1.0 - MOST_PROBABLE, MOST_PROBABLE)
         likely = np.where(is_correct, np.log(p), np.log1p(-p)).sum()
-        return float(-likely + _RIDGE * np.square(numbers[1:-1]).sum())
+        return float(-likely + 0.5 * np.square((numbers - _EXPECTED) / _DOUBT).sum())
 
-    start = np.array([0.0, 1.0, 1.0, 1.0, 0.3, 0.5])
     bounds = [(-20.0, 20.0), *[(0.0, 50.0)] * 4, (0.05, 3.0)]
-    best = optimize.minimize(cost, start, method="L-BFGS-B", bounds=bounds)
+    best = optimize.minimize(cost, _EXPECTED, method="L-BFGS-B", bounds=bounds)
     return Belief(trust=tuple(float(x) for x in best.x[:-1]), rival_power=float(best.x[-1]))
 
 

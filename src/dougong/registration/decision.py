@@ -17,7 +17,7 @@ from dougong.registration.icp import Icp, build_levels, refine
 from dougong.registration.laps import Laps
 from dougong.registration.overlap import apply
 from dougong.registration.prepare import Prepared
-from dougong.registration.probability import FITTED, Evidence
+from dougong.registration.probability import BELIEF, Evidence
 from dougong.registration.result import FineResult, Hypothesis
 from dougong.registration.rivals import is_same, middle_of
 from dougong.registration.roof_sides import height_left_open, weigh_height
@@ -115,9 +115,7 @@ def _evidence(ruling: Ruling, spread_m: float) -> Evidence:
         explained=ruling.explained,
         violation=ruling.violation,
         spread_m=spread_m,
-        rivals=tuple(
-            1.0 if c.fits_as_well else c.p_value for c in (*ruling.undecided, *ruling.beaten)
-        ),
+        rivals=tuple(c.chance for c in (*ruling.undecided, *ruling.beaten)),
     )
 
 
@@ -125,7 +123,7 @@ def _probability(status: str, ruling: Ruling, evidence: Evidence) -> float:
     """Return the probability of the pose; 0 where it is refused or what is known contradicts it."""
     if status == "failed" or ruling.overruled is not None:
         return 0.0
-    return FITTED.probability(evidence)
+    return BELIEF.probability(evidence)
 
 
 def _icp(params: Register) -> Icp:

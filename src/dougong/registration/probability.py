@@ -9,9 +9,10 @@ it: the trust in the fit itself, a logistic function of the evidence.
     logit(trust) = constant + a ln(sharpness) + b explained - c violation - d ln(spread / 50 mm)
 
 a, b, c, d and `rival_power` are not negative, so more evidence never makes a pose less probable.
-They were fitted by maximum likelihood on generated pairs with known answers:
-``dougong evaluate probability``, which also measures the probabilities on other seeds and on
-kinds of building that the fit has not seen.
+Their values are expected ones and not yet fitted: the probability orders poses, and is not
+calibrated. ``benchmarks/fit_probability.py`` fits them on generated pairs with known answers;
+``dougong evaluate probability`` measures on other seeds, and on kinds of building that the fit has
+not seen, how often a pose is right at each declared probability.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 MOST_PROBABLE = 0.999
-"""Nothing that was seen on some thousand pairs proves more than this."""
+"""No number of pairs that can be measured proves more than this."""
 _SPREAD_M = 0.05
 _LEAST_SPREAD_M, _MOST_SPREAD_M = 0.005, 1.0
 _MOST_SHARPNESS = 20.0
@@ -43,7 +44,7 @@ class Evidence:
     def terms(self) -> tuple[float, ...]:
         """Return what each coefficient of the trust is multiplied with.
 
-        Bounded, since beyond these bounds more of it was not seen to mean more.
+        Bounded: what is ten times sharper than needed is not ten times surer.
         """
         spread = float(np.clip(self.spread_m, _LEAST_SPREAD_M, _MOST_SPREAD_M))
         return (
@@ -76,4 +77,5 @@ def shares(p_values: Sequence[float], power: float) -> float:
     return float(np.sum(doubt**power))
 
 
-FITTED = Belief(trust=(-1.0, 1.0, 2.0, 10.0, 0.5), rival_power=0.5)
+BELIEF = Belief(trust=(0.0, 1.0, 2.0, 10.0, 0.5), rival_power=0.5)
+"""What is expected before any fit; some thousand pairs are to replace it."""

@@ -89,9 +89,14 @@ class Comparison:
     p_value: float
     """Chance of so much evidence for the winner if blocks did not prefer either."""
     blocks: int
-    fits_as_well: bool = False
-    """The rival explains what the clouds share under it as well as the winner does, so that it
-    loses only by sharing less; see `fits_as_well`."""
+    p_shared: float | None = None
+    """`p_value` over what both poses share, of a rival that loses only by sharing less; see
+    `shared_chance`. None: it does not explain what it shares as well as the winner does."""
+
+    @property
+    def chance(self) -> float:
+        """Return the p-value that counts: over all, or over what is shared if that is larger."""
+        return self.p_value if self.p_shared is None else max(self.p_value, self.p_shared)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,13 +212,13 @@ def rule(
     results = [
         replace(
             compare(court, winner, other, params.block_m),
-            fits_as_well=fits_as_well(court, winner, other, params),
+            p_shared=shared_chance(court, winner, other, params),
         )
         for other in others
     ]
     results += [compare(court, winner, other, params.block_m) for other in twins]
     is_told = [
-        not c.fits_as_well and is_beaten(c, params, is_near(c.T, winner.T, at)) for c in results
+        c.p_shared is None and is_beaten(c, params, is_near(c.T, winner.T, at)) for c in results
     ]
     beaten = [c for c, told in zip(results, is_told, strict=True) if told]
     undecided = [c for c, told in zip(results, is_told, strict=True) if not told]
@@ -259,8 +264,12 @@ def is_beaten(comparison: Comparison, params: Verdict, is_close: bool = False) -
     return comparison.gain >= params.gain and comparison.p_value <= limit
 
 
-def fits_as_well(court: Court, winner: Testimony, rival: Testimony, params: Verdict) -> bool:
-    """Say whether a rival is contradicted no more than the winner by what both clouds show.
+def shared_chance(
+    court: Court, winner: Testimony, rival: Testimony, params: Verdict
+) -> float | None:
+    """Return the chance that a rival is as good as the winner where both clouds show something.
+
+    None for a rival that is contradicted more than the winner there.
 
     What lies outside the other cloud's plan counts against a pose in `compare`, else one could
     win by moving the clouds apart. But unseen is not empty: where each cloud shows another end
@@ -275,22 +284,23 @@ def fits_as_well(court: Court, winner: Testimony, rival: Testimony, params: Verd
         for side in (slice(0, split), slice(split, None))
     )
     if share < params.least_overlap:
-        return False
+        return None
     loss = [
         float(part @ pose.loss) / max(float(part.sum()), 1e-300)
         for part, pose in zip(shared, (winner, rival), strict=True)
     ]
     if loss[1] > loss[0] + params.gain:
-        return False
+        return None
     common = compare(court, winner, rival, params.block_m, winner.is_within & rival.is_within)
     if is_beaten(common, params, is_close=True):
-        return False
+        return None
     if support(court, rival) < params.least_explained:
-        return False
+        return None
     # Any wall can be laid on any other with the rest of the cloud outside: of a pose that shares
     # little, as much is asked as of the winner.
     is_held = share >= _SHARED or sharpness(court, rival) >= params.least_sharpness
-    return is_held and violation(court, rival) <= params.most_violation
+    is_free = violation(court, rival) <= params.most_violation
+    return common.p_value if is_held and is_free else None
 
 
 def _refined(court: Court, levels: tuple[Level, ...], T: Transform, icp: Icp) -> Testimony:

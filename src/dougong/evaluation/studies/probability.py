@@ -21,7 +21,7 @@ from dougong.evaluation.calibration import (
 from dougong.evaluation.studies import Findings, Setting, measured
 from dougong.evaluation.trial_pairs import KINDS, TRAINED
 from dougong.pipeline.progress import Progress
-from dougong.registration.probability import FITTED
+from dougong.registration.probability import BELIEF
 
 FIRST_SEED = 100_000
 """Seeds below are the fit's."""
@@ -55,7 +55,7 @@ def summary(name: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     A pair whose poses were all refused counts with probability 0, except in the last group.
     """
-    p = probabilities(rows, FITTED)
+    p = probabilities(rows, BELIEF)
     is_correct = np.array([bool(row["is_correct"]) for row in rows])
     said_ok = [row for row in rows if row["status"] == "ok"]
     wrong = [row for row in said_ok if not row["is_correct"]]
@@ -107,7 +107,7 @@ def draw_reliability(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         chosen = [row for row in by_group[name] if "probability" in row]
         panel.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="declared = observed")
         if chosen:
-            p = probabilities(chosen, FITTED)
+            p = probabilities(chosen, BELIEF)
             table = reliability(p, np.array([bool(row["is_correct"]) for row in chosen]))
             declared = [row["declared"] for row in table]
             observed = np.array([row["observed"] for row in table])
@@ -139,5 +139,5 @@ def draw_reliability(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         panel.grid(alpha=0.3)
     figure.supxlabel("declared probability that the pose is right (within 50 mm)", fontsize=10)
     figure.supylabel("share that was right", fontsize=10)
-    panels[0].legend(fontsize=8, loc="upper left")
+    panels[0].legend(fontsize=8, loc="lower right")
     figure.savefig(path, dpi=130)
