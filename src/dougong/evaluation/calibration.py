@@ -44,10 +44,12 @@ def measure(kind: str, seed: int, settings: Register = SETTINGS) -> dict[str, An
     row |= {"status": found.status, "reason": found.reason, "tre95_m": tre95}
     row["is_correct"] = found.T is not None and tre95 is not None and tre95 <= CORRECT_TRE95_M
     evidence = found.evidence
-    if found.T is None or evidence is None:
+    if evidence is None:
         return row
+    if found.T is not None:
+        row["probability"] = found.probability
+    # Of refused poses too: where the limits should lie is read from both.
     return row | {
-        "probability": found.probability,
         "sharpness": evidence.sharpness,
         "explained": evidence.explained,
         "violation": evidence.violation,
@@ -57,13 +59,17 @@ def measure(kind: str, seed: int, settings: Register = SETTINGS) -> dict[str, An
 
 
 def _registered(pair: TrialPair, settings: Register) -> tuple[Found, float | None]:
+    """Return the verdict and how far its best pose, refused or not, is from the truth."""
     clouds = [Cloud.from_points(points) for points in (pair.source, pair.target)]
     one = prepare(clouds[0], "lidar", settings.prepare)
     two = prepare(clouds[1], "photogrammetry", settings.prepare)
     found = decide(one, two, plan_search(one, two, settings.plan), settings)
-    if found.T is None or pair.truth is None:
+    T = found.T
+    if T is None and found.ruling is not None:
+        T = found.ruling.winner.T
+    if T is None or pair.truth is None:
         return found, None
-    matrix = found.T.copy()
+    matrix = T.copy()
     origins = [cloud.frame.origin for cloud in clouds]
     matrix[:3, 3] += origins[1] - matrix[:3, :3] @ origins[0]
     return found, pose_errors(matrix, pair.truth).tre95_m

@@ -139,5 +139,6 @@ def draw_reliability(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         panel.grid(alpha=0.3)
     figure.supxlabel("declared probability that the pose is right (within 50 mm)", fontsize=10)
     figure.supylabel("share that was right", fontsize=10)
-    panels[0].legend(fontsize=8, loc="lower right")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=2, fontsize=8)
     figure.savefig(path, dpi=130)
