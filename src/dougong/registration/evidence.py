@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong.filters import neighbourhood
+from dougong.registration.free_space import FreeSpace, free_space
 from dougong.registration.overlap import (
     Rung,
     apply,
@@ -42,6 +43,8 @@ _VIOLATION = 1.5
 # No roof or floor is thicker: what lies deeper below a top is not its underside.
 _THICKEST_M = 0.4
 _ABOVE_TOP_M = 0.75
+# Less of the structure than this, seen by chance, says nothing about free space.
+_LEAST_VISIBLE = 0.02
 _NORMAL_COSINE = float(np.cos(np.radians(45.0)))
 
 
@@ -89,6 +92,8 @@ class Witness:
     plan: _Plan
     sees_tops: bool
     """Taken from above: what stands higher than its surface contradicts it."""
+    free: FreeSpace | None = None
+    """What its scanners saw through; None where their places are unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,6 +125,9 @@ class Testimony:
     """(m,) inside the other cloud's plan."""
     is_within: Mask
     """(m,) inside it and not at its edge."""
+    is_visible: Mask
+    """(m,) where the other sensor would have seen a surface: inside its plan, or in front of what
+    its scanners saw."""
     total: float
     """Weighted mean loss."""
 
@@ -154,7 +162,15 @@ def _witness(prepared: Prepared) -> Witness:
         slack=0.75 * np.sqrt(prepared.weights_area[everything.index]),
         plan=_plan(prepared),
         sees_tops=prepared.kind == "photogrammetry",
+        free=_free_space(prepared, everything),
     )
+
+
+def _free_space(prepared: Prepared, everything: Rung) -> FreeSpace | None:
+    if prepared.kind != "lidar":
+        return None
+    seen_from = None if prepared.seen_from is None else prepared.seen_from[everything.index]
+    return free_space(everything.xyz, seen_from)
 
 
 def _plan(prepared: Prepared) -> _Plan:
@@ -183,7 +199,7 @@ def hear(court: Court, T: Transform) -> Testimony:
     """Return what both clouds' points say about `T` (source -> target)."""
     one = _hear_one(court.source, court.target, T, court.tolerance_m)
     two = _hear_one(court.target, court.source, inverse(T), court.tolerance_m)
-    loss, explained, comparable, inside, within = (
+    loss, explained, comparable, inside, within, visible = (
         np.concatenate([a, b]) for a, b in zip(one, two, strict=True)
     )
     weights = court.weights
@@ -194,13 +210,14 @@ def hear(court: Court, T: Transform) -> Testimony:
         is_comparable=comparable,
         is_inside=inside,
         is_within=within,
+        is_visible=visible,
         total=float(weights @ loss / max(float(weights.sum()), 1e-300)),
     )
 
 
 def _hear_one(
     from_: Witness, to: Witness, T: Transform, tolerance_m: float
-) -> tuple[Values, Mask, Mask, Mask, Mask]:
+) -> tuple[Values, Mask, Mask, Mask, Mask, Mask]:
     moved = apply(T, from_.points)
     normals = from_.normals @ T[:3, :3].T
     reach = tolerance_m + _RAMP_M
@@ -231,7 +248,11 @@ def _hear_one(
     if to.sees_tops:
         loss[is_inside & (moved[:, 2] > top + _ABOVE_TOP_M)] = _VIOLATION
     is_explained = is_inside & (error <= tolerance_m)
-    return loss, is_explained, is_near & is_inside, is_inside, is_within
+    is_visible = is_inside
+    if to.free is not None:
+        through, is_visible = to.free.look(moved)
+        loss[through & ~is_explained] = _VIOLATION
+    return loss, is_explained, is_near & is_inside, is_inside, is_within, is_visible
 
 
 def structure_weights(court: Court) -> Values:
@@ -256,10 +277,18 @@ def support(court: Court, testimony: Testimony) -> float:
 
 
 def violation(court: Court, testimony: Testimony) -> float:
-    """Return the share of structure inside the other's plan that stands in its free space."""
-    weights = structure_weights(court)
-    inside = float(weights @ testimony.is_inside)
-    return float(weights @ (testimony.loss > 1.0)) / max(inside, 1e-300)
+    """Return the share of visible structure that stands in the other sensor's free space.
+
+    The larger of both clouds' shares; one of which the other could see next to nothing is not
+    asked.
+    """
+    weights, split = structure_weights(court), len(court.source.points)
+    total, worst = float(weights.sum()), 0.0
+    for part in (slice(0, split), slice(split, None)):
+        visible = float(weights[part] @ testimony.is_visible[part])
+        if visible > _LEAST_VISIBLE * total:
+            worst = max(worst, float(weights[part] @ (testimony.loss[part] > 1.0)) / visible)
+    return worst
 
 
 def sharpness(court: Court, testimony: Testimony) -> float:

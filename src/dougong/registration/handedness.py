@@ -67,6 +67,7 @@ def _mirrored_witness(witness: Witness) -> Witness:
         points=witness.points * _FLIP,
         normals=witness.normals * _FLIP,
         everything=_mirrored_rung(witness.everything),
+        free=None if witness.free is None else witness.free.mirrored(),
         plan=replace(
             plan,
             low=np.array([-high, plan.low[1]]),

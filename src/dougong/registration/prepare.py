@@ -73,6 +73,8 @@ class Prepared:
     """(n,), or one for all: a roof overhead of which nobody knows the side, see `orientation`."""
     side_is_unknown: Mask | bool = False
     """(n,), or one for all: the same, and also where nothing tells that it may be an underside."""
+    seen_from: Points | None = None
+    """(n, 3) where the scanner of each point stood, NaN where unknown; None: unknown for all."""
     has_ground: bool = True
     levelling: Levelling = field(default_factory=Levelling)
     """What the walls say about z; `levelling.up` is trusted only where `is_relevelled`."""
@@ -122,6 +124,7 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
     ground = _ground(level, sigma, params, notes)
     stays = ground.stays
     up = upright.up if is_relevelled else np.array([0.0, 0.0, 1.0])
+    seen_from = sights(cloud, kept)
     seen = sides(
         plane.normals,
         xyz,
@@ -131,7 +134,7 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
         up,
         kind,
         spacing,
-        sights(cloud, kept),
+        seen_from,
     )
     return Prepared(
         xyz=np.ascontiguousarray(xyz[stays]),
@@ -146,6 +149,7 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
         spacing_m=spacing,
         sigma_m=sigma,
         kind=kind,
+        seen_from=None if seen_from is None else seen_from[stays],
         has_ground=ground.is_found,
         levelling=upright,
         is_relevelled=is_relevelled,
