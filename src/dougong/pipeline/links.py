@@ -1,6 +1,6 @@
 """How each mover of a project gets into the frame of the reference."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -54,35 +54,27 @@ class Linked:
         return [cloud.moved(self.matrix, reference.frame) for cloud in clouds]
 
 
-def register_all(
-    movers: Sequence[Mover],
-    reference: Mover,
+def register_pair(
+    source: Mover,
+    target: Mover,
+    clouds: tuple[Cloud, Cloud],
     params: Register,
     control: Mapping[str, ControlPoints],
     progress: Progress,
-) -> list[Linked]:
-    """Register every mover onto the reference."""
-    target = reference.joined()
-    params = params.model_copy(update={"filtered": True})
-    linked = []
-    for mover in movers:
-        if mover is reference:
-            linked.append(Linked(mover=mover, result=None))
-            continue
-        progress.stage(f"registering {mover.name} onto {reference.name}")
-        result = register(
-            mover.joined(),
-            target,
-            params,
-            source_kind=mover.kind,
-            target_kind=reference.kind,
-            control=control_of(control, mover.name, mover.entry),
-            scale=mover.scale,
-            is_declared=True,
-        )
-        progress.note(f"{mover.name} -> {reference.name}: {result.status}. {result.reason}")
-        linked.append(Linked(mover=mover, result=result, accepts_best=params.accept_best))
-    return linked
+) -> Registration:
+    """Register one mover onto another; `clouds` are theirs, joined."""
+    progress.stage(f"registering {source.name} onto {target.name}")
+    result = register(
+        *clouds,
+        params,
+        source_kind=source.kind,
+        target_kind=target.kind,
+        control=control_of(control, source.name, source.entry),
+        scale=source.scale,
+        is_declared=True,
+    )
+    progress.note(f"{source.name} -> {target.name}: {result.status}. {result.reason}")
+    return result
 
 
 def measured_link(link: Linked, reference: Mover, progress: Progress) -> Linked:

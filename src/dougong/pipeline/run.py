@@ -13,9 +13,10 @@ from dougong.pipeline.distances import (
     write_distances,
 )
 from dougong.pipeline.full_resolution import Place, full_notes, write_full_resolution
-from dougong.pipeline.links import Linked, measured_link, register_all
+from dougong.pipeline.links import Linked, measured_link
 from dougong.pipeline.loading import Loader
 from dougong.pipeline.memory import Room
+from dougong.pipeline.network import register_all
 from dougong.pipeline.outputs import write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Project
@@ -83,7 +84,8 @@ def run(
     movers = load_all(project, loader, control)
     reference = next(mover for mover in movers if mover.entry == project.reference())
     with clock.measure("register"):
-        linked = register_all(movers, reference, project.registration, control, progress)
+        found = register_all(movers, reference, project.registration, control, progress)
+        linked = found.linked
     with clock.measure("distances"):
         linked = [measured_link(link, reference, progress) for link in linked]
     documents = registration_documents(linked, reference, loader)
@@ -115,6 +117,7 @@ def run(
         "reference": reference.name,
         "clouds": [cloud_document(link, loader) for link in linked],
         "registrations": documents,
+        "network": found.document,
         "merged": merged,
         "full_resolution": full,
         "seconds": {**clock.seconds, "total": clock.total()},

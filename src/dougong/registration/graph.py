@@ -54,7 +54,8 @@ class Link:
 class LinkReport:
     """What the network says of one link."""
 
-    name: str
+    source: str
+    target: str
     is_checked: bool
     """False: it closes no loop, so that nothing can contradict it."""
     is_bad: bool
@@ -66,6 +67,11 @@ class LinkReport:
     loop_error_deg: float
     normalised: float
     """Its residual in the adjusted network in units of its covariance."""
+
+    @property
+    def name(self) -> str:
+        """Return how the link is called in words."""
+        return f"{self.source} -> {self.target}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -283,7 +289,8 @@ def _report(
         error_deg = float(np.degrees(np.linalg.norm(miss[:3])))
     is_large = error_m > _BAD_M or error_deg > _BAD_DEG
     return LinkReport(
-        name=link.name,
+        source=link.source,
+        target=link.target,
         is_checked=is_checked,
         is_bad=is_checked and size > _BAD and is_large,
         weight=float(weights[k]),

@@ -189,3 +189,26 @@ def _spread(covariance: Sequence[Sequence[float]] | None) -> str:
     sigma = np.sqrt(np.maximum(np.diag(np.array(covariance)), 0.0))
     turn, shift = np.degrees(np.linalg.norm(sigma[:3])), 1000 * np.linalg.norm(sigma[3:6])
     return f"{turn:.4f} deg, {shift:.1f} mm, at the middle of the overlap"
+
+
+def network_rows(network: Mapping[str, Any] | None) -> list[dict[str, str]]:
+    """Return the pairs of a network as words; none where there are only two clouds."""
+    return [] if network is None else [_network_row(row) for row in network["links"]]
+
+
+def _network_row(row: Mapping[str, Any]) -> dict[str, str]:
+    is_linked = row["weight"] is not None
+    loop = "-"
+    if row["loop_error_m"] is not None:
+        loop = f"{1000 * row['loop_error_m']:.1f} mm, {row['loop_error_deg']:.3f} deg"
+    remark = "" if row["is_checked"] else "no loop checks it"
+    if row["is_left_out"]:
+        remark = "left out: the others contradict it"
+    return {
+        "pair": f"{row['source']} onto {row['target']}",
+        "tone": TONES[row["status"]],
+        "word": WORDS[TONES[row["status"]]],
+        "overlap": "-" if row["overlap"] is None else f"{100 * row['overlap']:.0f} %",
+        "loop": loop,
+        "remark": remark if is_linked else "not a link",
+    }

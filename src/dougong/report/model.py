@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dougong.report.key_numbers import KeyNumber, key_numbers, pair_numbers
-from dougong.report.links import Link, link
+from dougong.report.links import Link, link, network_rows
 from dougong.report.verdict import Verdict, accuracy, plain, run_verdict
 
 
@@ -39,6 +39,9 @@ class Report:
     inputs: tuple[Mapping[str, Any], ...]
     parameters: tuple[tuple[str, str], ...]
     provenance: tuple[tuple[str, str], ...]
+    network: tuple[Mapping[str, str], ...] = ()
+    """Every pair that was registered, where there are three clouds or more: what, verdict, loop
+    error, remark."""
     legend: tuple[tuple[str, str], ...] = field(default=())
     """Cloud name and colour (CSS)."""
 
@@ -55,6 +58,7 @@ def from_run(result: Mapping[str, Any], demo: Mapping[str, Any] | None) -> Repor
         clouds=tuple(_cloud(cloud) for cloud in result["clouds"]),
         links=links,
         notes=tuple(result["notes"]),
+        network=tuple(network_rows(result.get("network"))),
         outputs=tuple(_outputs(result)),
         inputs=tuple(result["inputs"]),
         parameters=tuple(flat(result["parameters"])),
