@@ -7,7 +7,7 @@ Selecting selects both. A writer emits the records; only a moved cloud gets new 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -313,3 +313,25 @@ class Cloud:
             frame=replace(self.frame, origin=origin),
             viewpoints=None if self.viewpoints is None else self.viewpoints + shift,
         )
+
+
+Pieces = Callable[[], Iterable[Cloud]]
+"""Yields a cloud piece by piece, from its beginning at every call; at least one piece. All have
+one frame, header and layout."""
+
+
+def in_pieces(cloud: Cloud | Pieces) -> Pieces:
+    """Return a cloud as one piece; pieces as they are."""
+    return (lambda: (cloud,)) if isinstance(cloud, Cloud) else cloud
+
+
+def joined_pieces(pieces: Pieces) -> Cloud:
+    """Return a cloud that comes in pieces as a whole."""
+    parts = list(pieces())
+    if len(parts) == 1:
+        return parts[0]
+    return replace(
+        parts[0],
+        xyz=np.concatenate([part.xyz for part in parts]),
+        records=np.concatenate([part.records for part in parts]),
+    )

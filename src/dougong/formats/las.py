@@ -114,17 +114,22 @@ def _points(path: Path) -> Iterator[tuple[LasHeader, Any]]:
         yield header, take
 
 
-def has_mixed_channels(records: Records) -> bool:
-    """Say whether waveform records (point format 9, 10) hold several scanner channels.
+def waveform_channels(records: Records) -> set[int]:
+    """Return the scanner channels of waveform records (point format 9, 10); none of others.
 
-    lazrs 0.8 does not keep the waveform fields of such points: packing and unpacking changes
-    them. One channel, and the older formats 4 and 5, survive bit for bit.
+    lazrs 0.8 does not keep the waveform fields of points of several channels: packing and unpacking
+    changes them. One channel, and the older formats 4 and 5, survive bit for bit.
     """
     names = records.dtype.names or ()
-    if not {"wavepacket_index", "classification_flags"} <= set(names) or not len(records):
-        return False
-    channels = records["classification_flags"] & 0b110000
-    return bool((channels != channels[0]).any())
+    if not {"wavepacket_index", "classification_flags"} <= set(names):
+        return set()
+    channels = (records["classification_flags"] & 0b110000) >> 4
+    return set(np.flatnonzero(np.bincount(channels)).tolist())
+
+
+def has_mixed_channels(records: Records) -> bool:
+    """Say whether waveform records hold several scanner channels."""
+    return len(waveform_channels(records)) > 1
 
 
 def _too_large(path: Path, header: LasHeader) -> FormatError:

@@ -238,7 +238,7 @@ def _as_extra(
     elif values.ndim == 1:
         parts = [(short, values)]
     else:
-        notes.append(f"{name} holds {values[0].size} numbers per point, LAS at most 3: left out.")
+        notes.append(f"{name} holds {values[:1].size} numbers per point, LAS at most 3: left out.")
         return []
     found = []
     for key, column in parts:

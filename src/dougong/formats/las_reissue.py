@@ -15,6 +15,7 @@ import numpy as np
 
 from dougong.cloud import Cloud, Frame
 from dougong.formats.atomic import refuse_bad_target, replacing
+from dougong.formats.las import waveform_channels
 from dougong.formats.las_fields import Facts, facts_of
 from dougong.formats.las_header import LasHeader
 from dougong.formats.las_records import OutsideLattice, Whole, las_parts
@@ -115,8 +116,7 @@ class _Job:
             box = np.stack([np.minimum(low, box[0]), np.maximum(high, box[1])])
             boxes[station] = box, matrix
             if isinstance(chunk.header, LasHeader):
-                channel = chunk.attribute("scanner_channel")
-                channels |= set(np.unique(channel).tolist()) if channel is not None else set()
+                channels |= waveform_channels(chunk.records)
                 continue
             for name, found in facts_of(chunk).items():
                 facts[name] = found if name not in facts else facts[name].joined(found)

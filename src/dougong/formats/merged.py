@@ -2,54 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.cloud import Cloud, Records
+from dougong.cloud import Cloud, Pieces, Records, in_pieces
 from dougong.errors import FrameError, InputError, OutputError
 from dougong.formats.atomic import refuse_bad_target
 from dougong.formats.las_header import POINT_FORMATS, LasHeader, Vlr, new_header
+from dougong.formats.las_pieces import LasForm, las_form
 from dougong.formats.las_records import (
     describe_extras,
     descriptions_of,
     extra_type,
-    las_parts,
     scaling_for,
     set_integers,
-    upgraded,
     with_crs,
 )
-from dougong.formats.model import Written
-from dougong.formats.registry import family_of, write_las_parts
+from dougong.formats.model import Hold, Written
+from dougong.formats.registry import family_of, write_las_records
 from dougong.formats.units import is_same_crs
 
 _HISTORY = {b"LASF_Projection", b"LASF_Spec", b"copc", b"laszip encoded"}
 
 
 def write_merged(
-    clouds: Sequence[Cloud],
+    clouds: Sequence[Cloud | Pieces],
     path: Path | str,
     *,
     source_ids: Sequence[int],
     overwrite: bool = False,
+    hold: Hold | None = None,
 ) -> Written:
     """Write clouds that share a reference system as one file of point format 6, 7 or 8.
 
     Every attribute of every cloud is kept, 0 where a cloud has none; the extra dimension
-    `source_id` tells the clouds apart. Each axis has the finest step of all clouds. Memory: the
-    records of all clouds once more.
+    `source_id` tells the clouds apart. Each axis has the finest step of all clouds. Memory: a piece
+    of a cloud, and what COPC holds.
 
     Parameters
     ----------
-    clouds : sequence of Cloud
+    clouds : sequence of Cloud or Pieces
         At least one; empty ones are passed over.
     source_ids : sequence of int
         One per cloud, 0..65535; `source_id` is uint8 where all are below 256, else uint16.
+    hold : Hold, optional
+        What COPC may hold, and where the rest goes meanwhile.
 
     Raises
     ------
@@ -67,18 +69,34 @@ def write_merged(
         raise InputError(msg)
     if min(source_ids) < 0 or max(source_ids) > 65535:
         raise InputError(f"source ids must lie in 0..65535, got {list(source_ids)}.")
-    for cloud in clouds:
-        refuse_bad_target(path, overwrite=overwrite, source=getattr(cloud.header, "source", None))
-    _refuse_mixed_frames(clouds)
-    filled = [(cloud, ident) for cloud, ident in zip(clouds, source_ids, strict=True) if len(cloud)]
-    if not filled:
+    sources = [in_pieces(cloud) for cloud in clouds]
+    firsts = [next(iter(pieces())) for pieces in sources]
+    for first in firsts:
+        refuse_bad_target(path, overwrite=overwrite, source=getattr(first.header, "source", None))
+    _refuse_mixed_frames(firsts)
+    parts = [
+        _Part(pieces, form, ident, first.frame.crs)
+        for pieces, first, ident in zip(sources, firsts, source_ids, strict=True)
+        if (form := las_form(pieces, modern=True)).points
+    ]
+    if not parts:
         raise OutputError(f"no cloud has a point left, so {path.name} was not written.")
     notes: list[str] = []
-    header, records = _joined(filled, notes)
-    write_las_parts(path, family, header, records)
+    header = _joined_header(parts, notes)
+    points = sum(part.form.points for part in parts)
+    write_las_records(path, family, header, _records(parts, header), points=points, hold=hold)
     return Written(
-        path=path, points=len(records), bytes=path.stat().st_size, notes=tuple(dict.fromkeys(notes))
+        path=path, points=points, bytes=path.stat().st_size, notes=tuple(dict.fromkeys(notes))
     )
+
+
+class _Part(NamedTuple):
+    """One cloud on its way into the merged file."""
+
+    pieces: Pieces
+    form: LasForm
+    ident: int
+    crs: str | None
 
 
 def _refuse_mixed_frames(clouds: Sequence[Cloud]) -> None:
@@ -94,34 +112,33 @@ def _refuse_mixed_frames(clouds: Sequence[Cloud]) -> None:
             raise FrameError(msg)
 
 
-def _joined(filled: Sequence[tuple[Cloud, int]], notes: list[str]) -> tuple[LasHeader, Records]:
-    parts = []
-    for cloud, ident in filled:
-        header, records, said = las_parts(cloud, modern=True)
-        if header.point_format not in (6, 7, 8):
-            header, records = upgraded(header, records, said)
-        notes += [f"{cloud.name}: {note}" for note in said]
-        parts.append((header, records, ident))
-    point_format = max(header.point_format for header, _, _ in parts)
-    scale = np.min([header.scale for header, _, _ in parts], axis=0)
-    bounds = np.concatenate([_corners(header, records) for header, records, _ in parts])
+def _joined_header(parts: Sequence[_Part], notes: list[str]) -> LasHeader:
+    forms = [part.form for part in parts]
+    notes += [f"{form.name}: {note}" for form in forms for note in form.notes]
+    point_format = max(form.header.point_format for form in forms)
+    scale = np.min([form.header.scale for form in forms], axis=0)
+    bounds = np.concatenate([form.corners for form in forms])
     scale, offset = scaling_for(bounds, scale, "the merged cloud")
-    if all(np.array_equal(part[0].offset, parts[0][0].offset) for part in parts):
-        offset = _kept_offset(parts[0][0].offset, bounds, scale, offset)
-    wide = max(ident for _, _, ident in parts) > 255
-    extras = _union([records.dtype for _, records, _ in parts], notes)
+    first = forms[0].header
+    if all(np.array_equal(form.header.offset, first.offset) for form in forms):
+        offset = _kept_offset(first.offset, bounds, scale, offset)
+    wide = max(part.ident for part in parts) > 255
+    extras = _union([form.layout for form in forms], notes)
     extras["source_id"] = np.dtype("<u2" if wide else "u1")
-    known = _descriptions([header for header, _, _ in parts], extras, notes)
-    header = describe_extras(_base(parts[0][0], point_format), extras, known)
-    header = with_crs(header, filled[0][0].frame.crs, notes).with_scaling(scale, offset)
-    merged = np.zeros(sum(len(records) for _, records, _ in parts), dtype=header.dtype)
-    at = 0
-    while parts:
-        own, records, ident = parts.pop(0)
-        _fill(merged[at : at + len(records)], own, records, header)
-        merged["source_id"][at : at + len(records)] = ident
-        at += len(records)
-    return header, merged
+    known = _descriptions([form.header for form in forms], extras, notes)
+    header = describe_extras(_base(first, point_format), extras, known)
+    return with_crs(header, parts[0].crs, notes).with_scaling(scale, offset)
+
+
+def _records(parts: Sequence[_Part], header: LasHeader) -> Iterator[Records]:
+    """Yield the merged records, piece by piece."""
+    for part in parts:
+        for piece in part.pieces():
+            own = part.form.records(piece)
+            merged = np.zeros(len(own), dtype=header.dtype)
+            _fill(merged, part.form.header, own, header)
+            merged["source_id"] = part.ident
+            yield merged
 
 
 def _base(first: LasHeader, point_format: int) -> LasHeader:
@@ -131,12 +148,6 @@ def _base(first: LasHeader, point_format: int) -> LasHeader:
     # The kind of GPS time (week or standard) is one flag for the file.
     flags = 0b10000 | (first.raw[6] & 1)
     return replace(header, vlrs=kept).patched("H", 6, flags)
-
-
-def _corners(header: LasHeader, records: Records) -> NDArray[np.float64]:
-    low = np.array([int(records[name].min()) for name in "XYZ"])
-    high = np.array([int(records[name].max()) for name in "XYZ"])
-    return np.stack([low, high]) * header.scale + header.offset
 
 
 def _kept_offset(

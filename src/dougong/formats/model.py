@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,13 @@ class FileInfo:
     point_format: int | None = None
     """LAS point format."""
     notes: tuple[str, ...] = ()
+
+
+class Hold(NamedTuple):
+    """What a writer that must see all points may hold of them, and where the rest goes."""
+
+    points: int
+    folder: Path
 
 
 Severity = Literal["error", "warning", "info"]

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dougong.cloud import Cloud
+from dougong.cloud import Cloud, Pieces, in_pieces, joined_pieces
 from dougong.errors import FormatError, FrameError, InputError, OutputError
-from dougong.formats.model import Written
+from dougong.formats.model import Hold, Written
 from dougong.formats.stream import Scan, iterate_scans, opened, read_scans, stem_of
 from dougong.formats.units import is_same_crs, metre_form
 
@@ -210,11 +210,12 @@ def family_of(path: Path) -> str:
 
 
 def write(
-    cloud: Cloud,
+    cloud: Cloud | Pieces,
     path: Path | str,
     *,
     overwrite: bool = False,
     notes: Sequence[str] | None = None,
+    hold: Hold | None = None,
 ) -> Written:
     """Write a cloud as LAS, LAZ, COPC, E57 or PLY, chosen by suffix; all of it or nothing.
 
@@ -223,8 +224,12 @@ def write(
 
     Parameters
     ----------
+    cloud : Cloud or Pieces
+        A cloud that comes in pieces is never held as a whole, unless as E57 or PLY.
     notes : sequence of str, optional
         Put in front of the notes returned.
+    hold : Hold, optional
+        What COPC may hold, and where the rest goes meanwhile.
 
     Raises
     ------
@@ -234,32 +239,40 @@ def write(
     """
     path = Path(path)
     family = family_of(path)
-    from dougong.formats.atomic import refuse_bad_target, replacing
+    from dougong.formats.atomic import refuse_bad_target
+    from dougong.formats.las_pieces import las_form
 
-    refuse_bad_target(path, overwrite=overwrite, source=getattr(cloud.header, "source", None))
+    pieces = in_pieces(cloud)
+    first = next(iter(pieces()))
+    refuse_bad_target(path, overwrite=overwrite, source=getattr(first.header, "source", None))
+    if family in (".e57", ".ply"):
+        return _write_whole(joined_pieces(pieces), path, family, notes or ())
+    form = las_form(pieces, modern=family == ".copc.laz", packed=family == ".laz")
+    if not form.points:
+        raise OutputError(f"{form.name} has no points left, so {path.name} was not written.")
+    records = (form.records(piece) for piece in pieces())
+    write_las_records(path, family, form.header, records, points=form.points, hold=hold)
+    return Written(
+        path=path,
+        points=form.points,
+        bytes=path.stat().st_size,
+        notes=(*(notes or ()), *form.notes),
+    )
+
+
+def _write_whole(cloud: Cloud, path: Path, family: str, notes: Sequence[str]) -> Written:
+    """Write a cloud as E57 or PLY."""
     if not len(cloud):
         raise OutputError(f"{cloud.name} has no points left, so {path.name} was not written.")
     if family == ".e57":
-        return _write_e57([cloud], path, notes or ())
-    if family == ".ply":
-        from dougong.formats.ply_write import ply_parts, write_ply
+        return _write_e57([cloud], path, notes)
+    from dougong.formats.atomic import replacing
+    from dougong.formats.ply_write import ply_parts, write_ply
 
-        head, records, said = ply_parts(cloud)
-        with replacing(path, expected_bytes=len(head) + records.nbytes) as sink:
-            write_ply(sink, head, records)
-    else:
-        from dougong.formats.las_records import las_parts
-
-        header, records, said = las_parts(
-            cloud, modern=family == ".copc.laz", packed=family == ".laz"
-        )
-        write_las_parts(path, family, header, records)
-    return Written(
-        path=path,
-        points=len(records),
-        bytes=path.stat().st_size,
-        notes=(*(notes or ()), *said),
-    )
+    head, records, said = ply_parts(cloud)
+    with replacing(path, expected_bytes=len(head) + records.nbytes) as sink:
+        write_ply(sink, head, records)
+    return Written(path=path, points=len(records), bytes=path.stat().st_size, notes=(*notes, *said))
 
 
 def write_stations(
@@ -315,18 +328,29 @@ def _write_e57(clouds: Sequence[Cloud], path: Path, notes: Sequence[str]) -> Wri
     )
 
 
-def write_las_parts(path: Path, family: str, header: Any, records: Any) -> None:
+def write_las_records(
+    path: Path,
+    family: str,
+    header: Any,
+    pieces: Iterable[Any],
+    *,
+    points: int,
+    hold: Hold | None = None,
+) -> None:
     """Write a LAS header and its records as `family` (".las", ".laz", ".copc.laz")."""
     from dougong.formats.atomic import replacing
-    from dougong.formats.copc import write_copc
+    from dougong.formats.copc import HELD_POINTS, CopcWriter
     from dougong.formats.las_write import LasWriter
 
     # Compressed points take about half; only named in the message of a full disk.
-    expected = records.nbytes if family == ".las" else records.nbytes // 2
+    expected = header.point_bytes * points // (1 if family == ".las" else 2)
     with replacing(path, expected_bytes=expected + 65536) as sink:
+        writer: CopcWriter | LasWriter
         if family == ".copc.laz":
-            write_copc(sink, header, records)
-            return
-        writer = LasWriter(sink, header, is_compressed=family == ".laz")
-        writer.append(records)
+            most, scratch = hold or (HELD_POINTS, path.parent)
+            writer = CopcWriter(sink, header, scratch=scratch, most_points=most)
+        else:
+            writer = LasWriter(sink, header, is_compressed=family == ".laz")
+        for records in pieces:
+            writer.append(records)
         writer.close()

@@ -55,51 +55,83 @@ def cube_codes(
 
 
 @kernel
-def pick_level(
-    codes: NDArray[np.uint64],
-    node_shift: np.uint64,
-    cell_shift: np.uint64,
-    capacity: int,
-    is_last: bool,
-    is_taken: NDArray[np.bool_],
+def priority(code: np.uint64) -> np.uint64:
+    """Return a number that orders codes as if by chance; no two codes share one."""
+    v = (code ^ (code >> np.uint64(31))) * np.uint64(0x7FB5D329728EA185)
+    v = (v ^ (v >> np.uint64(27))) * np.uint64(0x81DADEF4BC2DD44D)
+    return v ^ (v >> np.uint64(33))
+
+
+@kernel
+def leaf_levels(
+    codes: NDArray[np.uint64], first: int, capacity: int, deepest: int, out: NDArray[np.int8]
 ) -> None:
-    """Mark the points that stay at one level: all of a small node, one per cell of a large one.
+    """Fill `out` with the level at which each point's node is small enough to be a leaf.
+
+    Parameters
+    ----------
+    codes : ndarray, shape (n,)
+        Sorted; all points of one node of level `first`.
+    first, deepest : int
+        No node above `first` is a leaf; every node of level `deepest` is.
+    capacity : int
+        A node of at most so many points is a leaf.
+    out : ndarray, shape (n,)
+    """
+    n = len(codes)
+    out[:] = -1
+    for level in range(first, deepest + 1):
+        shift = np.uint64(3 * (LEVELS - level))
+        start = 0
+        is_done = True
+        while start < n:
+            if out[start] >= 0:
+                start += 1
+                continue
+            node = codes[start] >> shift
+            stop = start
+            while stop < n and (codes[stop] >> shift) == node:
+                stop += 1
+            if stop - start <= capacity or level == deepest:
+                out[start:stop] = level
+            else:
+                is_done = False
+            start = stop
+        if is_done:
+            return
+
+
+@kernel
+def pick_per_cell(
+    codes: NDArray[np.uint64], cell_shift: np.uint64, is_taken: NDArray[np.bool_]
+) -> None:
+    """Mark the first in `priority` of each cell's points: what one level shows of them.
 
     Parameters
     ----------
     codes : ndarray, shape (n,)
         Sorted codes of the points no level above has taken.
-    node_shift, cell_shift : uint64
-        Bits below a node of this level, and below a cell of its grid.
-    is_last : bool
-        Nothing lies below: take everything.
+    cell_shift : uint64
+        Bits below a cell of this level's grid.
     is_taken : ndarray, shape (n,)
-        Filled.
+        Filled. Of equal codes the first counts.
 
     Notes
     -----
-    Which point of a cell stays follows from a hash of the cell's code (Fibonacci hashing), so
-    the same cloud gives the same file, and no corner of the cells is favoured.
+    A least value of a set is the least of its parts' least: parts of a cloud can be worked on
+    apart. Priorities are a hash, so no corner of the cells is favoured.
     """
     n = len(codes)
-    node_start = 0
-    while node_start < n:
-        node = codes[node_start] >> node_shift
-        node_stop = node_start
-        while node_stop < n and (codes[node_stop] >> node_shift) == node:
-            node_stop += 1
-        if is_last or node_stop - node_start <= capacity:
-            for i in range(node_start, node_stop):
-                is_taken[i] = True
-        else:
-            start = node_start
-            while start < node_stop:
-                cell = codes[start] >> cell_shift
-                stop = start
-                while stop < node_stop and (codes[stop] >> cell_shift) == cell:
-                    is_taken[stop] = False
-                    stop += 1
-                scrambled = (cell * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(33)
-                is_taken[start + np.int64(scrambled % np.uint64(stop - start))] = True
-                start = stop
-        node_start = node_stop
+    start = 0
+    while start < n:
+        cell = codes[start] >> cell_shift
+        best, least = start, priority(codes[start])
+        stop = start
+        while stop < n and (codes[stop] >> cell_shift) == cell:
+            is_taken[stop] = False
+            own = priority(codes[stop])
+            if own < least:
+                best, least = stop, own
+            stop += 1
+        is_taken[best] = True
+        start = stop
