@@ -376,6 +376,36 @@ def evaluate(
     return verb(study, folder, setting, overwrite=overwrite, progress=progress)
 
 
+def bench(
+    out: Path,
+    *,
+    operations: Sequence[str],
+    sizes: Sequence[int],
+    threads: int | None,
+    repeats: int,
+    seed: int,
+    work: Path | None,
+    overwrite: bool,
+    progress: Progress,
+) -> tuple[Document, str]:
+    """Measure ours beside the installed peers (see `evaluation.bench`).
+
+    With `threads` None: with one thread, and with all that this process may use.
+    """
+    from dougong.evaluation.bench import Setting
+    from dougong.evaluation.bench import bench as verb
+    from dougong.threads import get_threads
+
+    setting = Setting(
+        operations=operations,
+        sizes=sizes,
+        threads=sorted({1, get_threads()}) if threads is None else [threads],
+        repeats=repeats,
+        seed=seed,
+    )
+    return verb(_named(out), setting, overwrite=overwrite, work=work, progress=progress)
+
+
 def report(folder: Path, *, progress: Progress) -> Document:
     """Rebuild ``report.html`` in a result folder."""
     return {"report": str(_build_report(folder, progress))}

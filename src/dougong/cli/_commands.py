@@ -7,6 +7,7 @@ from cyclopts import App, CycloptsError
 
 import dougong
 from dougong.cli import (
+    bench,
     check,
     demo,
     evaluate,
@@ -63,6 +64,7 @@ for _command in (
     report,
     view,
     evaluate,
+    bench,
 ):
     _command.command.__doc__ = unwrapped(_command.command.__doc__ or "")
     app.command(_command.command, name=_command.__name__.rsplit(".", 1)[1])

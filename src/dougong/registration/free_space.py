@@ -29,15 +29,18 @@ _TRIED_POINTS = 8000
 _TRIED_STEP_M = 2.0
 _MOST_TRIED = 1200
 _EYE_M = 1.6
+_EYE_SPREAD_M = 1.5
 _BESIDE_M = 4.0
 _TRIED_CELL = np.radians(3.0)
 _FOUND_CELL = np.radians(2.0)
 _HIDDEN = (1.15, 0.5)
 _MOST_HIDDEN = 0.03
-# Four metres beside, so much more must be hidden (this many times, and this share): in the typical
-# direction, and in the one in which the site looks most alike.
-_TYPICAL = (2.0, 0.004)
-_LEAST = (1.3, 0.001)
+# Four metres beside, so much more must be hidden in the typical direction: this many times, and
+# this share.
+_TYPICAL = (1.5, 0.003)
+_LEAST = 0.0005
+"""And in every direction this share more: a lone wall looks alike from many places."""
+_STARTS = 4
 _RING_M = 4.0
 _FINEST_M = 0.05
 
@@ -103,7 +106,7 @@ def find_place(points: Points) -> NDArray[np.float64] | None:
 
     From its own place a scan has one range per direction; from elsewhere surfaces hide others.
     Places at eye height are tried all over the plan, and the best is shifted while it gets better.
-    Good to about a metre in plan; the height comes out up to 3 m too high, since level ground has
+    Good to about a metre in plan; the height comes out up to 1.5 m too high, since level ground has
     many ranges within one cell at grazing angles.
     Scans from several stations hide points from everywhere, and a single wall hides none from
     anywhere: both have no answer.
@@ -114,25 +117,31 @@ def find_place(points: Points) -> NDArray[np.float64] | None:
     tried = _eye_places(few)
     if not len(tried):
         return None
-    best = tried[int(np.argmin([_hidden(few, place, _TRIED_CELL) for place in tried]))]
-    least, step = _hidden(few, best, _FOUND_CELL), 1.0
-    while step > _FINEST_M:
-        around = [best + step * move for move in _MOVES]
-        costs = [_hidden(few, place, _FOUND_CELL) for place in around]
-        if min(costs) < least:
-            least, best = min(costs), around[int(np.argmin(costs))]
-        else:
-            step /= 2.0
+    order = np.argsort([_hidden(few, place, _TRIED_CELL) for place in tried], kind="stable")
+    found = [_settled(few, tried[k]) for k in order[:_STARTS]]
+    least, best = min(found, key=lambda item: item[0])
     ring = [
         best + _RING_M * np.array([np.cos(t), np.sin(t), 0.0]) for t in np.arange(8) * np.pi / 4
     ]
     beside = [_hidden(few, place, _FOUND_CELL) for place in ring]
-    is_sure = (
-        least <= _MOST_HIDDEN
-        and float(np.median(beside)) >= _TYPICAL[0] * least + _TYPICAL[1]
-        and min(beside) >= _LEAST[0] * least + _LEAST[1]
-    )
-    return best if is_sure else None
+    is_apart = float(np.median(beside)) >= _TYPICAL[0] * least + _TYPICAL[1]
+    is_alone = min(beside) >= least + _LEAST
+    return best if least <= _MOST_HIDDEN and is_apart and is_alone else None
+
+
+def _settled(points: Points, place: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """Return how little is hidden from the best place near `place`, and that place."""
+    least, step = _hidden(points, place, _FOUND_CELL), 1.0
+    lowest, highest = place[2] - _EYE_SPREAD_M, place[2] + _EYE_SPREAD_M
+    while step > _FINEST_M:
+        around = [place + step * move for move in _MOVES]
+        around = [near for near in around if lowest <= near[2] <= highest]
+        costs = [_hidden(points, near, _FOUND_CELL) for near in around]
+        if min(costs) < least:
+            least, place = min(costs), around[int(np.argmin(costs))]
+        else:
+            step /= 2.0
+    return least, place
 
 
 _MOVES = np.array(
