@@ -19,7 +19,7 @@ from dougong.errors import InputError
 ROOT = Path(__file__).parents[1]
 COMMANDS = [
     "demo", "run", "plan", "init", "info", "check", "filter", "register", "transform",
-    "report", "view", "evaluate",
+    "report", "view", "evaluate", "bench",
 ]  # fmt: skip
 
 

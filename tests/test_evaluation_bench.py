@@ -1,0 +1,62 @@
+"""`dougong bench`: what it measures, and that the same work is asked of everyone."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dougong.cli import call
+from dougong.evaluation.bench import ours, peers
+from dougong.evaluation.bench.contenders import OPERATIONS
+from dougong.evaluation.bench.scenes import SCENES
+from dougong.evaluation.bench.table import as_markdown
+
+COUNT = 30_000
+
+
+@pytest.mark.parametrize(
+    ("operation", "peer"),
+    [("knn", peers.knn_scipy), ("sor", peers.sor_scipy), ("ror", peers.ror_scipy)],
+)
+def test_ours_and_scipy_answer_the_same_question(operation, peer):
+    work = OPERATIONS[operation]
+    arrays = SCENES[work.scene](COUNT, 0)
+    own = work.answer(work.contenders[0].run(arrays, 1), arrays)
+    assert own == pytest.approx(work.answer(peer(arrays, 1), arrays), rel=1e-12)
+
+
+def test_our_icp_finds_the_way_back():
+    work = OPERATIONS["icp"]
+    arrays = SCENES["pair"](COUNT, 0)
+    assert work.answer(ours.icp(arrays, 1), arrays)["displacement_p95_mm"] < 50.0
+
+
+def test_bench_writes_rows_and_keeps_them(tmp_path):
+    asked = ["bench", "--only", "ror", "--points", f"{COUNT}", "--repeats", "1", "--quiet"]
+    asked += ["--threads", "1", "--json", "--out", str(tmp_path)]
+    assert call(asked) == 0
+    document = json.loads((tmp_path / "bench.json").read_text())
+    (group,) = document["groups"].values()
+    rows = {row["name"]: row for row in group["rows"]}
+    assert {"dougong", "scipy"} <= set(rows)
+    assert rows["dougong"]["answer"] == rows["scipy"]["answer"]
+    assert rows["dougong"]["cpu_s"] > 0.0
+    assert "radius outlier removal" in as_markdown(document)
+    before = (tmp_path / "bench.json").stat().st_mtime_ns
+    assert call(asked) == 0
+    assert (tmp_path / "bench.json").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [(["--only", "sorr"], "no operation 'sorr'"), (["--points", "10"], "--points must be")],
+)
+def test_what_cannot_be_measured_is_refused(tmp_path, capsys, wrong, words):
+    assert call(["bench", *wrong, "--out", str(tmp_path / "x")]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_scenes_are_the_same_for_a_seed():
+    for make in SCENES.values():
+        one, two = make(COUNT, 3), make(COUNT, 3)
+        assert all(np.array_equal(one[key], two[key]) for key in one)
