@@ -13,8 +13,8 @@ from dougong.cli._shell import Answer, Listener, execute
 def command(
     *,
     out: Path = Path("dougong-bench"),
-    only: tuple[str, ...] = (),
-    points: tuple[float, ...] = (1e5, 1e6),
+    only: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = (),
+    points: Annotated[tuple[float, ...], Parameter(negative="")] = (1e5, 1e6),
     repeats: int = 3,
     overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     common: Common = DEFAULT,
