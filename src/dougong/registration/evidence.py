@@ -93,7 +93,7 @@ class Witness:
     sees_tops: bool
     """Taken from above: what stands higher than its surface contradicts it."""
     free: FreeSpace | None = None
-    """What its scanners saw through; None where their places are unknown."""
+    """What its scanner saw through; None where it is not one scan, or from an unknown place."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,7 +127,7 @@ class Testimony:
     """(m,) inside it and not at its edge."""
     is_visible: Mask
     """(m,) where the other sensor would have seen a surface: inside its plan, or in front of what
-    its scanners saw."""
+    its scanner saw."""
     total: float
     """Weighted mean loss."""
 
@@ -249,7 +249,8 @@ def _hear_one(
         loss[is_inside & (moved[:, 2] > top + _ABOVE_TOP_M)] = _VIOLATION
     is_explained = is_inside & (error <= tolerance_m)
     is_visible = is_inside
-    if to.free is not None:
+    # A drone's cloud bulges into the air under eaves: it is no witness against a scanner.
+    if to.free is not None and not from_.sees_tops:
         through, is_visible = to.free.look(moved)
         loss[through & ~is_explained] = _VIOLATION
     return loss, is_explained, is_near & is_inside, is_inside, is_within, is_visible

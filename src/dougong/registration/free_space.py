@@ -21,7 +21,6 @@ _LEAST_AROUND = 7
 """Of a cell and its eight neighbours so many must hold a range for it to be trusted."""
 _MARGIN_M = 0.4
 _MARGIN_SHARE = 0.05
-_MOST_PLACES = 24
 _LEAST_POINTS = 500
 
 # Finding the place: the true one sees one range per direction, any other looks through surfaces.
@@ -47,34 +46,34 @@ _FINEST_M = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreeSpace:
-    """The pictures of ranges of one cloud's scanners."""
+    """The picture of ranges of one scan."""
 
-    places: Points
-    """(k, 3) where the scanners stood."""
+    place: NDArray[np.float64]
+    """(3,) where the scanner stood."""
     ranges: NDArray[np.float64]
-    """(k, rows, columns) nearest range in and around each direction; NaN where none is sure."""
+    """(rows, columns) nearest range in and around each direction; NaN where none is sure."""
 
     def mirrored(self) -> FreeSpace:
         """Return the same with x negated: azimuths run the other way."""
         columns = (_ROWS - 1 - np.arange(2 * _ROWS)) % (2 * _ROWS)
         return FreeSpace(
-            places=self.places * np.array([-1.0, 1.0, 1.0]), ranges=self.ranges[:, :, columns]
+            place=self.place * np.array([-1.0, 1.0, 1.0]), ranges=self.ranges[:, columns]
         )
 
     def look(self, points: Points) -> tuple[Mask, Mask]:
-        """Return which `points` (n, 3) some scanner saw through, and which it could have seen."""
-        through, visible = np.zeros(len(points), bool), np.zeros(len(points), bool)
-        for place, ranges in zip(self.places, self.ranges, strict=True):
-            row, column, distance = _directions(points, place, _ROWS)
-            seen = ranges[row, column]
-            # Unknown directions compare false.
-            through |= distance < (1.0 - _MARGIN_SHARE) * seen - _MARGIN_M
-            visible |= distance < seen + _MARGIN_M
+        """Return which `points` (n, 3) the scanner saw through, and which it could have seen."""
+        row, column, distance = _directions(points, self.place, _ROWS)
+        seen = self.ranges[row, column]
+        # Unknown directions compare false.
+        through: Mask = distance < (1.0 - _MARGIN_SHARE) * seen - _MARGIN_M
+        visible: Mask = distance < seen + _MARGIN_M
         return through, visible
 
 
 def free_space(points: Points, seen_from: Points | None) -> FreeSpace | None:
-    """Return what the scanners of a cloud saw through; None where nobody knows their places.
+    """Return what the scanner of a cloud saw through; None where it is no single scan.
+
+    Several scans thinned as one have holes in each picture, where a point of another one was kept.
 
     Parameters
     ----------
@@ -86,19 +85,10 @@ def free_space(points: Points, seen_from: Points | None) -> FreeSpace | None:
     """
     if seen_from is None:
         place = find_place(points)
-        if place is None:
-            return None
-        return FreeSpace(places=place[None], ranges=_ranges(points, place)[None])
-    known = np.isfinite(seen_from[:, 0])
-    places, of = np.unique(seen_from[known], axis=0, return_inverse=True)
-    counts = np.bincount(of.reshape(-1), minlength=len(places))
-    chosen = np.sort(np.argsort(-counts, kind="stable")[:_MOST_PLACES])
-    chosen = chosen[counts[chosen] >= _LEAST_POINTS]
-    if not len(chosen):
-        return None
-    own = points[known]
-    ranges = [_ranges(own[of.reshape(-1) == k], places[k]) for k in chosen]
-    return FreeSpace(places=places[chosen], ranges=np.stack(ranges))
+    else:
+        places = np.unique(seen_from, axis=0)
+        place = places[0] if len(places) == 1 and np.isfinite(places).all() else None
+    return None if place is None else FreeSpace(place=place, ranges=_ranges(points, place))
 
 
 def find_place(points: Points) -> NDArray[np.float64] | None:
