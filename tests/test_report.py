@@ -15,6 +15,7 @@ from dougong.report import build
 from dougong.report.drawing import View, draw_dots, draw_surface, height_colours, oblique_view
 from dougong.report.figures import find_place, overview, slices
 from dougong.report.layers import BLUE, COLOURS, Layer, rigid_inverse
+from dougong.report.links import network_rows
 from dougong.report.model import flat, from_registration, from_run
 from dougong.report.plates import length_text, line_chart, plate, round_length
 from dougong.report.render import render
@@ -441,3 +442,14 @@ def test_the_certificate_says_what_a_searched_scale_is_worth():
     words, _ = certificate(None, scale_search=search)
     assert "searched: one unit of drone is 0.37 m (sigma 0.007 %)" in words
     assert "not observable (scan) the turn about the vertical" in words
+
+
+def test_a_link_that_the_others_contradict_is_not_shown_as_registered():
+    link = {
+        "source": "c", "target": "b", "status": "ok", "overlap": 0.5, "is_checked": True,
+        "is_left_out": True, "weight": 0.0, "loop_error_m": 0.65, "loop_error_deg": 3.0,
+    }  # fmt: skip
+    (row,) = network_rows({"links": [link]})
+    assert (row["tone"], row["word"]) == ("bad", "Left out")
+    assert row["loop"] == "650.0 mm, 3.000 deg"
+    assert network_rows(None) == []

@@ -201,13 +201,15 @@ def _network_row(row: Mapping[str, Any]) -> dict[str, str]:
     loop = "-"
     if row["loop_error_m"] is not None:
         loop = f"{1000 * row['loop_error_m']:.1f} mm, {row['loop_error_deg']:.3f} deg"
+    tone = TONES[row["status"]]
+    word = WORDS[tone]
     remark = "" if row["is_checked"] else "no loop checks it"
     if row["is_left_out"]:
-        remark = "left out: the others contradict it"
+        tone, word, remark = "bad", "Left out", "the other links contradict it"
     return {
         "pair": f"{row['source']} onto {row['target']}",
-        "tone": TONES[row["status"]],
-        "word": WORDS[TONES[row["status"]]],
+        "tone": tone,
+        "word": word,
         "overlap": "-" if row["overlap"] is None else f"{100 * row['overlap']:.0f} %",
         "loop": loop,
         "remark": remark if is_linked else "not a link",
