@@ -1,5 +1,6 @@
 """Names for the arrays that cross function borders."""
 
+from collections.abc import Callable, Iterable
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -7,6 +8,9 @@ from numpy.typing import NDArray
 
 Points: TypeAlias = NDArray[np.float64]
 """(n, 3), C-contiguous, metres, in a local frame."""
+
+Blocks: TypeAlias = Callable[[], Iterable[Points]]
+"""Yields a cloud block by block, from its beginning and in the same order at every call."""
 
 Values: TypeAlias = NDArray[np.float64]
 """(n,), one number per point; the unit is in the name of the variable."""

@@ -5,7 +5,8 @@ close to where the cloth comes to rest are ground. The cloud enters only through
 heights and leaves through a height difference, so two passes over the points and one cloth do.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -15,14 +16,14 @@ from scipy.ndimage import distance_transform_edt
 
 from dougong._checks import as_points
 from dougong.errors import InputError
-from dougong.filters.extent import plan_box
-from dougong.filters.low_outliers import LowOutliers, low_outliers
+from dougong.filters.extent import plan_box_of
+from dougong.filters.low_outliers import LowOutliers, find_levels, is_low_outlier, low_notes
 from dougong.filters.selection import Selection
 from dougong.kernels import cloth as cloth_kernels
 from dougong.kernels import raster
 from dougong.params import Parameters
 from dougong.threads import for_blocks
-from dougong.typing import Mask, Points, Values
+from dougong.typing import Blocks, Mask, Points, Values
 
 KIND: Literal["local", "two-pass", "global"] = "two-pass"
 
@@ -157,19 +158,44 @@ def cloth_simulation(points: Points, params: ClothSimulation | None = None) -> S
     points = as_points(points)
     if len(points) == 0:
         return _selection(np.empty(0), params, ())
-    notes: tuple[str, ...] = ()
-    carriers = points
-    if params.guard is not None:
-        guarded = low_outliers(points, params.guard)
-        notes += guarded.notes
-        if not guarded.is_kept.all():
-            carriers = points[guarded.is_kept]
-    cloth = lay_cloth(carriers, params)
-    heights = cloth.height_above(points)
-    lost = int(np.isnan(heights).sum())
+    cloth, low = guarded_cloth(lambda: (points,), len(points), params)
+    found = classify(points, cloth, params)
+    lost = int((found.attributes["ground_class"] == UNKNOWN).sum())
+    return replace(found, notes=cloth_notes(low, lost, len(points)))
+
+
+def cloth_notes(low: int, lost: int, points: int) -> tuple[str, ...]:
+    """Return what is to be said where of all `points` so many are low, and without a height."""
+    notes = low_notes(low, points)
     if lost:
-        notes += (f"{lost} of {len(points)} points are too far from any ground for a height",)
-    return _selection(heights, params, notes)
+        notes += (f"{lost} of {points} points are too far from any ground for a height",)
+    return notes
+
+
+def guarded_cloth(blocks: Blocks, points: int, params: ClothSimulation) -> tuple[Cloth, int]:
+    """Return the cloth under a cloud of so many `points` (>= 1) that comes in blocks.
+
+    Points that ``params.guard`` finds below the ground do not carry it; they are counted. Some
+    passes over the blocks; about 60 bytes per particle.
+    """
+    if params.guard is None:
+        return lay_cloth_under(blocks, points, params), 0
+    levels = find_levels(blocks, points, params.guard)
+    # A bit per point spares the passes below from asking again.
+    bits_of = [np.packbits(is_low_outlier(block, levels)) for block in blocks()]
+    low = sum(int(np.bitwise_count(bits).sum()) for bits in bits_of)
+
+    def carriers() -> Iterator[Points]:
+        for block, bits in zip(blocks(), bits_of, strict=True):
+            is_carrier = ~np.unpackbits(bits, count=len(block)).view(np.bool_)
+            yield block[is_carrier] if bits.any() else block
+
+    return lay_cloth_under(carriers if low else blocks, points - low, params), low
+
+
+def classify(points: Points, cloth: Cloth, params: ClothSimulation) -> Selection:
+    """Return the class of some `points` (n, 3) of the cloud that `cloth` lies under."""
+    return _selection(cloth.height_above(points), params, ())
 
 
 def _selection(heights: Values, params: ClothSimulation, notes: tuple[str, ...]) -> Selection:
@@ -201,15 +227,21 @@ def lay_cloth(points: Points, params: ClothSimulation) -> Cloth:
     InputError
         The cloth would have more than `MAX_PARTICLES` particles.
     """
+    return lay_cloth_under(lambda: (points,), len(points), params)
+
+
+def lay_cloth_under(blocks: Blocks, points: int, params: ClothSimulation) -> Cloth:
+    """Return the cloth of `lay_cloth` under a cloud of so many `points` that comes in blocks."""
     cell = params.cloth_resolution_m
-    low, high, lowest = plan_box(points)
+    low, high, lowest = plan_box_of(blocks, points)
     shape = _shape(low, high, cell)
     origin = np.append(low - _BUFFER * cell, lowest)
-    heights = np.full(shape, np.nan)
-    if params.particle_height == "nearest":
-        raster.nearest_heights(points, origin, cell, np.full(shape, np.inf), heights)
-    else:
-        raster.lowest_heights(points, origin, cell, heights)
+    heights, best = np.full(shape, np.nan), np.full(shape, np.inf)
+    for block in blocks():
+        if params.particle_height == "nearest":
+            raster.nearest_heights(block, origin, cell, best, heights)
+        else:
+            raster.lowest_heights(block, origin, cell, heights)
     has_data = ~np.isnan(heights)
     surface = -_filled(heights, has_data)
     height = np.empty(shape)

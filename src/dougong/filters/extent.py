@@ -4,7 +4,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, label
 
 from dougong.kernels import raster
-from dougong.typing import Points, Values
+from dougong.typing import Blocks, Points, Values
 
 _BINS = 64
 _FAR_BINS = 16
@@ -21,36 +21,45 @@ def plan_box(points: Points) -> tuple[Values, Values, float]:
     far; the box shrinks to the others, and again until nothing is far.
     points (n >= 1, 3), metres; low, high (2,): x and y; lowest: the smallest z inside.
     """
+    return plan_box_of(lambda: (points,), len(points))
+
+
+def plan_box_of(blocks: Blocks, points: int) -> tuple[Values, Values, float]:
+    """Return the `plan_box` of a cloud of so many `points` that comes in blocks, in some passes."""
     everywhere = np.full(2, np.inf)
-    bounds = _bounds(points, -everywhere, everywhere)
+    bounds = _bounds(blocks, -everywhere, everywhere)
     while True:
         low, high = bounds[:2], bounds[2:4]
-        cut = _without_far_bins(points, low, high)
+        cut = _without_far_bins(blocks, points, low, high)
         if cut is None:
             return low, high, float(bounds[4])
-        before, bounds = bounds, _bounds(points, *cut)
+        before, bounds = bounds, _bounds(blocks, *cut)
         if np.array_equal(bounds, before):
             return low, high, float(bounds[4])
 
 
-def _bounds(points: Points, low: Values, high: Values) -> Values:
+def _bounds(blocks: Blocks, low: Values, high: Values) -> Values:
     out = np.array([np.inf, np.inf, -np.inf, -np.inf, np.inf])
-    raster.plan_bounds(points, low, high, out)
+    for block in blocks():
+        raster.plan_bounds(block, low, high, out)
     return out
 
 
-def _without_far_bins(points: Points, low: Values, high: Values) -> tuple[Values, Values] | None:
+def _without_far_bins(
+    blocks: Blocks, points: int, low: Values, high: Values
+) -> tuple[Values, Values] | None:
     """Return the part of a plan box without far bins; None where there are none."""
     size = float((high - low).max()) / _BINS
     if size <= 0:
         return None
     count = np.zeros((_BINS + 1, _BINS + 1), np.int64)
-    raster.plan_count(points, low, high, size, count)
+    for block in blocks():
+        raster.plan_count(block, low, high, size, count)
     is_near = distance_transform_edt(count == 0) <= _FAR_BINS / 2
     groups, number = label(is_near, structure=np.ones((3, 3)))
     groups[count == 0] = 0
     total = np.bincount(groups.ravel(), weights=count.ravel(), minlength=number + 1)
-    few = max(_FEW_SHARE * len(points), min(_FEW_POINTS, _FEW_SHARE_OF_SMALL * len(points)))
+    few = max(_FEW_SHARE * points, min(_FEW_POINTS, _FEW_SHARE_OF_SMALL * points))
     is_kept = total > few
     is_kept[0] = False
     if is_kept[1:].all():

@@ -13,13 +13,13 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from dougong._checks import as_points
 from dougong.errors import InputError
-from dougong.filters.extent import plan_box
+from dougong.filters.extent import plan_box_of
 from dougong.filters.selection import Selection
 from dougong.kernels import low_outliers as kernels
 from dougong.kernels import raster
 from dougong.params import Parameters
 from dougong.threads import for_blocks
-from dougong.typing import Index, Points, Values
+from dougong.typing import Blocks, Index, Mask, Points, Values
 
 KIND: Literal["local", "two-pass", "global"] = "two-pass"
 
@@ -54,8 +54,6 @@ class LowOutliers(Parameters):
 class _Columns(NamedTuple):
     """The voxels of a cloud, column by column (see kernels.low_outliers)."""
 
-    keys: Index
-    """(n,) voxel of each point."""
     unique: Index
     """(m,) occupied voxels, ascending."""
     counts: Index
@@ -65,8 +63,18 @@ class _Columns(NamedTuple):
     shape: tuple[int, int, int]
     cell: float
     level: float
-    bottom: float
-    """z of the lower side of level 0."""
+    origin: Values
+    """(3,) low corner of voxel 0."""
+
+
+class Levels(NamedTuple):
+    """What the whole cloud says about its ground: enough to judge any part of it."""
+
+    columns: _Columns
+    is_level: NDArray[np.bool_]
+    """(m,) over the voxels: True in a surface large enough to be real."""
+    floor: Values
+    """(rows * columns,) z below which a point of no level is low; NaN: unknown."""
 
 
 def halo_m(params: LowOutliers) -> float:
@@ -104,36 +112,71 @@ def low_outliers(points: Points, params: LowOutliers | None = None) -> Selection
     points = as_points(points)
     is_low = np.zeros(len(points), np.bool_)
     if len(points):
-        columns = _columns(points, params)
-        is_level = _levels(columns, params)
-        floor = _ground(columns, is_level, params) - params.min_depth_m
-
-        def block(start: int, stop: int) -> None:
-            kernels.mark_low(
-                points[start:stop],
-                columns.keys[start:stop],
-                columns.unique,
-                columns.starts,
-                columns.shape[2],
-                is_level,
-                floor,
-                is_low[start:stop],
-            )
-
-        for_blocks(len(points), _BLOCK, block)
-    number = int(is_low.sum())
-    notes = (f"{number} of {len(points)} points lie below the ground",) if number else ()
-    return Selection(is_kept=~is_low, notes=notes)
+        is_low = is_low_outlier(points, find_levels(lambda: (points,), len(points), params))
+    return Selection(is_kept=~is_low, notes=low_notes(int(is_low.sum()), len(points)))
 
 
-def _columns(points: Points, params: LowOutliers) -> _Columns:
-    low, high, lowest = plan_box(points)
-    cell = params.cell_m or _cell_for(points, low, high)
+def low_notes(low: int, points: int) -> tuple[str, ...]:
+    """Return what is to be said where `low` of all `points` are low outliers."""
+    return (f"{low} of {points} points lie below the ground",) if low else ()
+
+
+def find_levels(blocks: Blocks, points: int, params: LowOutliers) -> Levels:
+    """Return the levels of a cloud of so many `points` (>= 1) that comes in blocks.
+
+    Some passes over the blocks; about 40 bytes per occupied voxel.
+    """
+    columns = _columns(blocks, points, params)
+    is_level = _levels(columns, params)
+    return Levels(columns, is_level, _ground(columns, is_level, params) - params.min_depth_m)
+
+
+def is_low_outlier(points: Points, levels: Levels) -> Mask:
+    """Say which of some `points` (n, 3) of the cloud are low outliers."""
+    columns = levels.columns
+    is_low = np.zeros(len(points), np.bool_)
+
+    def block(start: int, stop: int) -> None:
+        keys = np.empty(stop - start, np.int64)
+        part = points[start:stop]
+        kernels.voxel_keys(part, columns.origin, columns.cell, columns.level, columns.shape, keys)
+        kernels.mark_low(
+            part,
+            keys,
+            columns.unique,
+            columns.starts,
+            columns.shape[2],
+            levels.is_level,
+            levels.floor,
+            is_low[start:stop],
+        )
+
+    for_blocks(len(points), _BLOCK, block)
+    return is_low
+
+
+def _columns(blocks: Blocks, points: int, params: LowOutliers) -> _Columns:
+    low, high, lowest = plan_box_of(blocks, points)
+    cell = params.cell_m or _cell_for(blocks, low, high)
     level = max(params.min_depth_m / 2, cell / 4)
     rows, columns = _plan_shape(low, high, cell)
-    levels = int((points[:, 2].max() - lowest) / level) + 2
+    highest = max(float(block[:, 2].max()) for block in blocks() if len(block))
+    levels = int((highest - lowest) / level) + 2
     shape = (rows, columns, levels)
     origin = np.append(low, lowest)
+    unique, counts = np.empty(0, np.int64), np.empty(0, np.int64)
+    for block in blocks():
+        found = _occupied(block, origin, cell, level, shape)
+        unique, counts = _added(unique, counts, *found) if len(unique) else found
+    starts = np.empty(rows * columns + 1, np.int64)
+    kernels.column_starts(unique, levels, starts)
+    return _Columns(unique, counts, starts, shape, cell, level, origin)
+
+
+def _occupied(
+    points: Points, origin: Values, cell: float, level: float, shape: tuple[int, int, int]
+) -> tuple[Index, Index]:
+    """Return the voxels, ascending, in which `points` lie, and how many in each."""
     keys = np.empty(len(points), np.int64)
 
     def block(start: int, stop: int) -> None:
@@ -142,10 +185,16 @@ def _columns(points: Points, params: LowOutliers) -> _Columns:
     for_blocks(len(points), _BLOCK, block)
     unique, count = np.empty((2, len(points)), np.int64)
     number = kernels.runs(np.sort(keys), unique, count)
-    unique, count = unique[:number].copy(), count[:number].copy()
-    starts = np.empty(rows * columns + 1, np.int64)
-    kernels.column_starts(unique, levels, starts)
-    return _Columns(keys, unique, count, starts, shape, cell, level, lowest)
+    return unique[:number].copy(), count[:number].copy()
+
+
+def _added(keys: Index, counts: Index, more: Index, more_counts: Index) -> tuple[Index, Index]:
+    """Return the union of two sorted sets of voxels, with their counts added."""
+    unique, place = np.unique(np.concatenate([keys, more]), return_inverse=True)
+    total = np.zeros(len(unique), np.int64)
+    total[place[: len(keys)]] = counts
+    total[place[len(keys) :]] += more_counts
+    return unique, total
 
 
 def _plan_shape(low: Values, high: Values, cell: float) -> tuple[int, int]:
@@ -159,14 +208,15 @@ def _plan_shape(low: Values, high: Values, cell: float) -> tuple[int, int]:
     return int(rows), int(columns)
 
 
-def _cell_for(points: Points, low: Values, high: Values) -> float:
+def _cell_for(blocks: Blocks, low: Values, high: Values) -> float:
     """Return the smallest cell at which half of the occupied ones hold 4 points or more."""
     cell = _SMALLEST_CELL_M
     while True:
         columns, rows = np.floor((high - low) / cell) + 1
         if rows * columns <= _MAX_CELLS:
             count = np.zeros((int(rows), int(columns)), np.int64)
-            raster.plan_count(points, low, high, cell, count)
+            for block in blocks():
+                raster.plan_count(block, low, high, cell, count)
             is_enough = float(np.median(count[count > 0])) >= _POINTS_PER_CELL
             if is_enough or cell >= _LARGEST_CELL_M:
                 return cell
@@ -200,7 +250,7 @@ def _ground(columns: _Columns, is_level: NDArray[np.bool_], params: LowOutliers)
     rows, plan_columns, levels = columns.shape
     lowest = np.full(rows * plan_columns, np.inf)
     voxels = columns.unique[is_level]
-    np.minimum.at(lowest, voxels // levels, voxels % levels * columns.level + columns.bottom)
+    np.minimum.at(lowest, voxels // levels, voxels % levels * columns.level + columns.origin[2])
     size = 2 * int(np.ceil(params.ground_window_m / 2 / columns.cell)) + 1
     grid = minimum_filter(lowest.reshape(rows, plan_columns), size, mode="constant", cval=np.inf)
     grid[np.isinf(grid)] = -np.inf

@@ -4,7 +4,7 @@ METHOD.md 1.1. Kept points keep every attribute; which one is kept depends only 
 on their order. Kernels are imported when called: the model loads without Numba.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -16,12 +16,9 @@ from dougong.errors import InputError
 from dougong.filters.selection import Selection
 from dougong.params import Parameters
 from dougong.threads import for_blocks
-from dougong.typing import Index, Mask, Points
+from dougong.typing import Blocks, Index, Mask, Points
 
 KIND: Literal["local", "two-pass", "global"] = "two-pass"
-
-Blocks = Callable[[], Iterable[Points]]
-"""Yields a cloud block by block, from its beginning at every call."""
 
 _TRIM = 0.005
 """Share of the points at each end of an axis that may be too far off to shape the root cube."""
