@@ -11,8 +11,10 @@ from dougong.errors import OutputError
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid, robust_box
 from dougong.formats import faults_of, read, write
 from dougong.pipeline import memory
-from dougong.tiles.decimate import Spool, decimate
+from dougong.tiles.cloud import read_arrays
 from dougong.tiles.grid import TileGrid, grid_for, part
+from dougong.tiles.partition import partition
+from dougong.tiles.spool import Spool
 from dougong.tiles.store import RowFile, Rows
 
 
@@ -41,21 +43,31 @@ def pieces(cloud, size):
 def test_tiles_keep_what_the_whole_keeps(tmp_path, params, chunk, tile_points):
     cloud = site()
     whole = octree_voxel_grid(cloud.xyz, params, records=cloud.records)
-    tiled = decimate(Spool(pieces(cloud, chunk), tmp_path), params, tile_points)
-    np.testing.assert_array_equal(tiled.row, np.flatnonzero(whole.is_kept))
-    np.testing.assert_array_equal(tiled.cloud.records, cloud.records[whole.is_kept])
-    np.testing.assert_array_equal(tiled.cloud.xyz, cloud.xyz[whole.is_kept])
-    np.testing.assert_array_equal(tiled.voxel_count, whole.attributes["voxel_count"][whole.is_kept])
-    assert tiled.points_in == len(cloud)
-    assert tiled.faults == faults_of(cloud)
-    assert list(tmp_path.iterdir()) == []
+    spool = Spool(pieces(cloud, chunk), tmp_path)
+    tiled = partition(spool, params, tmp_path, tile_points, tile_points)
+    row, xyz, count = joined(tiled)
+    np.testing.assert_array_equal(row, np.flatnonzero(whole.is_kept))
+    np.testing.assert_array_equal(xyz, cloud.xyz[whole.is_kept])
+    np.testing.assert_array_equal(count, whole.attributes["voxel_count"][whole.is_kept])
+    assert tiled.facts["points_in"] == len(cloud)
+    assert tuple(tiled.facts["faults"]) == faults_of(cloud)
+    assert len(list(tmp_path.iterdir())) == len(tiled.tiles) + 1
+
+
+def joined(tiled):
+    """Return rows, coordinates and voxel counts of all tiles in the order of the cloud."""
+    held = [read_arrays(tiled.folder, tile, "points") for tile in tiled.tiles]
+    parts = [np.concatenate([h[name] for h in held]) for name in ("row", "xyz", "voxel_count")]
+    order = np.argsort(parts[0])
+    return [part[order] for part in parts]
 
 
 def test_one_voxel_with_more_points_than_a_tile_may_hold_ends(tmp_path):
     cloud = Cloud.from_points(np.full((5000, 3), 3.25))
-    tiled = decimate(Spool(pieces(cloud, 1000), tmp_path), OctreeVoxelGrid(), 100)
-    assert len(tiled.cloud) == 1
-    assert tiled.voxel_count.tolist() == [5000]
+    spool = Spool(pieces(cloud, 1000), tmp_path)
+    tiled = partition(spool, OctreeVoxelGrid(), tmp_path, 100, 100)
+    assert tiled.points == 1
+    assert joined(tiled)[2].tolist() == [5000]
 
 
 def test_a_voxel_lies_in_one_tile():
@@ -112,22 +124,35 @@ def scan(tmp_path):
 
 @pytest.fixture
 def little_room(monkeypatch):
-    """Make 190 kB enough for tiles of some 400 points."""
+    """Make 190 kB enough for tiles of some 3000 points and their halo."""
     monkeypatch.setattr(memory, "BASE_BYTES", 0)
     monkeypatch.setattr(memory, "BYTES_PER_POINT", 5)
     monkeypatch.setattr(memory, "BYTES_PER_WAITING_POINT", 1)
     monkeypatch.setattr(memory, "_LEAST_TILE_POINTS", 100)
+    monkeypatch.setattr(memory, "_BYTES_PER_BOOKED_POINT", 2)
+    monkeypatch.setattr(memory, "_BYTES_PER_TILE_POINT", 12)
 
 
 VOXEL = "octree_voxel_grid.voxel_m=0.1"
 
 
 def filtered_by(path, out, *options):
-    call(["filter", str(path), str(out), "--set", VOXEL, "--quiet", *options])
+    voxel = ("--set", VOXEL) if {"lidar", "octree_voxel_grid"} & set(options) else ()
+    assert call(["filter", str(path), str(out), *voxel, "--quiet", *options]) == 0
     return read(out), json.loads((out.parent / f"{out.name}.json").read_text())
 
 
-@pytest.mark.parametrize("what", [("--kind", "lidar"), ("--only", "octree_voxel_grid")])
+@pytest.mark.parametrize(
+    "what",
+    [
+        ("--kind", "lidar"),
+        ("--kind", "lidar", "--mark"),
+        ("--kind", "photogrammetry"),
+        ("--only", "octree_voxel_grid"),
+        ("--only", "cloth_simulation"),
+        ("--only", "pass_through", "--set", "pass_through.height_m=[-1, 3]"),
+    ],
+)
 def test_filter_is_the_same_on_tiles(scan, tmp_path, little_room, what):
     whole, said = filtered_by(scan, tmp_path / "whole.laz", *what, "--memory", "4GB")
     tiled, told = filtered_by(scan, tmp_path / "tiled.laz", *what, "--memory", "190kB")
@@ -148,7 +173,7 @@ def test_run_is_the_same_on_tiles_and_goes_on_where_it_was(scan, tmp_path, littl
         assert call([*tokens, "--work", str(work)]) == 0
         results.append(json.loads((tmp_path / name / "result.json").read_text()))
     said = capsys.readouterr().err
-    assert said.count("its voxel grid runs on tiles") == 2
+    assert said.count("it is filtered on tiles") == 2
     assert said.count("not filtered again") == 1
     assert len({result["result_hash"] for result in results}) == 1
     assert results[0]["notes"] == results[1]["notes"] == results[2]["notes"]
@@ -157,7 +182,7 @@ def test_run_is_the_same_on_tiles_and_goes_on_where_it_was(scan, tmp_path, littl
 
 def test_a_grid_that_leaves_too_much_is_refused(scan, tmp_path, little_room, capsys, monkeypatch):
     monkeypatch.setattr(memory, "BYTES_PER_POINT", 1000)
-    tokens = ["filter", str(scan), str(tmp_path / "out.laz"), "--kind", "lidar"]
+    tokens = ["run", "--lidar", str(scan), "--out", str(tmp_path / "out")]
     assert call([*tokens, "--memory", "190kB"]) == 2
     assert "points are left after the voxel grid" in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["scan.laz"]
+    assert not (tmp_path / "out").exists()

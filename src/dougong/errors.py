@@ -5,7 +5,8 @@ DougongError
 ├── FormatError         a file is damaged, empty or not what its name says
 ├── FrameError          two clouds live in frames that cannot be combined
 ├── RegistrationError   no pose can even be looked for (empty overlap, too few points)
-└── OutputError         a result cannot be written (exists already, disk full)
+├── OutputError         a result cannot be written (exists already, disk full)
+└── TileError           some tiles of a large cloud failed; the others are done
 
 Every message says, in this order: what is wrong, the value seen, what was expected, what to do.
 """
@@ -33,6 +34,10 @@ class RegistrationError(DougongError):
 
 class OutputError(DougongError):
     """A result cannot be written."""
+
+
+class TileError(DougongError):
+    """Some tiles of a cloud could not be worked on; the others are done."""
 
 
 class DataWarning(UserWarning):

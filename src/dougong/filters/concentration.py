@@ -4,7 +4,12 @@ Noise does not prefer carving: it lies round brackets as round walls. A filter w
 concentrates there takes the carving for noise, and nobody would see it in its total.
 """
 
+from __future__ import annotations
+
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from dougong.typing import Mask, Points, Values
 
@@ -19,6 +24,8 @@ LEAST_CELLS = 20
 RATIO, BEYOND = 3.0, 0.03
 """Said where the share taken in fine cells exceeds so many times that in plain ones, and is this
 much larger."""
+_STEPS = 1 << 30
+"""Steps per unit of surface variation, so that sums are exact."""
 
 
 def concentration_note(
@@ -38,18 +45,46 @@ def concentration_note(
     """
     if not len(points) or not spacing_m > 0:
         return None
+    return note_of(tally(points, is_kept, variation, spacing_m))
+
+
+class Tally(NamedTuple):
+    """Some cells, and what was taken in each."""
+
+    cells: NDArray[np.int64]
+    """(m, 3), each once."""
+    counts: NDArray[np.int64]
+    """(m, 3): points there were, points kept, steps of surface variation of the kept ones."""
+
+    def merged(self, other: Tally) -> Tally:
+        """Return both as one: parts of a cloud share cells."""
+        cells = np.concatenate([self.cells, other.cells])
+        counts = np.concatenate([self.counts, other.counts])
+        unique, place = np.unique(cells, axis=0, return_inverse=True)
+        total = np.zeros((len(unique), 3), np.int64)
+        np.add.at(total, place.reshape(-1), counts)
+        return Tally(unique, total)
+
+
+def tally(points: Points, is_kept: Mask, variation: Values, spacing_m: float) -> Tally:
+    """Return the cells of a cloud, or of a part of one, and what was taken in them."""
     cells = np.floor(points / (CELL_SPACINGS * spacing_m)).astype(np.int64)
-    cells -= cells.min(axis=0)
-    span = cells.max(axis=0) + 1
-    if float(span[0]) * float(span[1]) * float(span[2]) > 2.0**62:
-        return None
-    keys = (cells[:, 0] * span[1] + cells[:, 1]) * span[2] + cells[:, 2]
-    _, cell = np.unique(keys, return_inverse=True)
-    held = np.bincount(cell)
-    kept = np.bincount(cell[is_kept], minlength=len(held))
-    bends = np.bincount(cell[is_kept], weights=variation[is_kept], minlength=len(held))
+    order = np.lexsort(cells.T)
+    cells = cells[order]
+    is_first = np.ones(len(cells), np.bool_)
+    is_first[1:] = (cells[1:] != cells[:-1]).any(axis=1)
+    starts = np.flatnonzero(is_first)
+    kept = is_kept[order].astype(np.int64)
+    bends = np.rint(variation[order] * _STEPS).astype(np.int64) * kept
+    counts = np.stack([np.ones_like(kept), kept, bends], axis=1)
+    return Tally(cells[starts], np.add.reduceat(counts, starts, axis=0))
+
+
+def note_of(found: Tally) -> str | None:
+    """Return what is to be said of the cells of a whole cloud, see `concentration_note`."""
+    held, kept, bends = found.counts.T
     counted = kept >= LEAST_KEPT
-    is_fine = counted & (bends > FINE_VARIATION * kept)
+    is_fine = counted & (bends > FINE_VARIATION * _STEPS * kept)
     is_plain = counted & ~is_fine
     if is_fine.sum() < LEAST_CELLS or is_plain.sum() < LEAST_CELLS:
         return None

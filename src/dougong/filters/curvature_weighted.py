@@ -216,24 +216,36 @@ class _Population(NamedTuple):
     deviation: Values | float
 
 
-def _population(lattice: Lattice, curvature: Values, p: CurvatureWeighted) -> _Population:
+def _population(
+    lattice: Lattice, curvature: Values, p: CurvatureWeighted, totals: Totals | None = None
+) -> _Population:
     """Return the statistic and its reference population: eq. 5 and what eq. 6 compares with."""
     least = least_weighted_distance(lattice, curvature, p)
     is_alone = ~np.isfinite(least)
     step_m = p.radius_max_m * (1.0 + p.alpha) / _STATISTIC_STEPS
     steps = np.where(is_alone, -1.0, np.rint(least / step_m)).astype(np.int64)
     if p.rule == "global":
-        totals = Totals.of(steps[~is_alone])
+        totals = totals or Totals.of(steps[~is_alone])
         return _Population(is_alone, steps, totals.mean, totals.deviation)
     return _Population(is_alone, steps, *_local_statistics(lattice, steps, p.radius_init_m))
 
 
-def _verdict(lattice: Lattice, curvature: Values, p: CurvatureWeighted) -> tuple[Mask, Values]:
+def own_totals(points: ArrayLike, p: CurvatureWeighted, own: int) -> Totals:
+    """Return what the first `own` of `points` add to the statistics of rule ``global``."""
+    lattice = build_lattice(points, max(p.radius_init_m, p.radius_max_m))
+    curvature = surface_variation(lattice, p.radius_init_m)
+    found = _population(lattice, curvature, p)
+    return Totals.of(found.steps[(lattice.order < own) & ~found.is_alone])
+
+
+def _verdict(
+    lattice: Lattice, curvature: Values, p: CurvatureWeighted, totals: Totals | None
+) -> tuple[Mask, Values]:
     """Return the verdict (n,) of eq. 6 and its margin (n,), the statistic as a share of the cut.
 
     In sorted order. An empty neighbourhood is an outlier, its margin infinite.
     """
-    is_alone, steps, mean, deviation = _population(lattice, curvature, p)
+    is_alone, steps, mean, deviation = _population(lattice, curvature, p, totals)
     cut = mean + p.tau(curvature) * deviation
     is_outlier: Mask = is_alone | (steps > cut)
     # Half a step holds up a cut of zero, where all points are duplicates.
@@ -259,6 +271,7 @@ def curvature_weighted(
     params: CurvatureWeighted | None = None,
     *,
     voxel_count: ArrayLike | None = None,
+    whole: protective.Whole | Totals | None = None,
 ) -> Selection:
     """Choose the points that have a neighbour about as near as their surroundings do.
 
@@ -269,6 +282,8 @@ def curvature_weighted(
     params : CurvatureWeighted
     voxel_count : array_like, shape (n,), optional
         How many points each point stands for after decimation; used by `solid_voxel_count`.
+    whole : Whole or Totals, optional
+        Where the points are a part of a cloud: what ``protective`` and ``global`` know of it.
 
     Returns
     -------
@@ -287,14 +302,16 @@ def curvature_weighted(
     """
     p = params or CurvatureWeighted()
     if p.rule == "protective":
-        return _protective(points, p, voxel_count)
+        assert not isinstance(whole, Totals)
+        return judge_protective(points, p, voxel_count, whole)[0]
+    assert not isinstance(whole, protective.Whole)
     lattice = build_lattice(points, max(p.radius_init_m, p.radius_max_m))
     n = len(lattice.points)
     if n == 0:
         return Selection(is_kept=np.zeros(0, bool), attributes={"curvature": np.zeros(0)})
     curvature = surface_variation(lattice, p.radius_init_m)
     is_kept = np.empty(n, bool)
-    is_outlier, margin = _verdict(lattice, curvature, p)
+    is_outlier, margin = _verdict(lattice, curvature, p, whole)
     is_kept[lattice.order] = ~is_outlier
     if p.solid_voxel_count is not None:
         is_kept |= _is_solid(voxel_count, n, p.solid_voxel_count)
@@ -307,20 +324,24 @@ def curvature_weighted(
     )
 
 
-def _protective(
-    points: ArrayLike, p: CurvatureWeighted, voxel_count: ArrayLike | None
-) -> Selection:
-    verdict = protective.judge(points, p.alpha, p.gamma, p.surface_loss, p.reach_m)
+def judge_protective(
+    points: ArrayLike,
+    p: CurvatureWeighted,
+    voxel_count: ArrayLike | None,
+    whole: protective.Whole | None,
+) -> tuple[Selection, protective.Groups]:
+    """Return the choice of rule ``protective`` and what groups the points' own ones are in."""
+    verdict = protective.judge(points, p.alpha, p.gamma, p.surface_loss, p.reach_m, whole)
     is_kept = verdict.reason == protective.Taken.KEPT
     reason = verdict.reason
     if p.solid_voxel_count is not None:
         is_kept |= _is_solid(voxel_count, len(is_kept), p.solid_voxel_count)
         reason = np.where(is_kept, protective.Taken.KEPT, reason).astype(np.uint8)
     note = None
-    if len(is_kept):
+    if len(is_kept) and whole is None:
         spacing_m = float(np.median(verdict.spacing_m))
         note = concentration_note(as_points(points), is_kept, verdict.curvature, spacing_m)
-    return Selection(
+    selection = Selection(
         is_kept=is_kept,
         attributes={
             "curvature": verdict.curvature,
@@ -330,6 +351,7 @@ def _protective(
         },
         notes=() if note is None else (note,),
     )
+    return selection, verdict.groups
 
 
 def _is_solid(voxel_count: ArrayLike | None, n: int, at_least: int) -> Mask:

@@ -70,11 +70,20 @@ class _Columns(NamedTuple):
 class Levels(NamedTuple):
     """What the whole cloud says about its ground: enough to judge any part of it."""
 
-    columns: _Columns
+    unique: Index
+    """(m,) occupied voxels, ascending."""
+    starts: Index
+    """(rows * columns + 1,) where the run of each column begins in `unique`."""
     is_level: NDArray[np.bool_]
     """(m,) over the voxels: True in a surface large enough to be real."""
     floor: Values
     """(rows * columns,) z below which a point of no level is low; NaN: unknown."""
+    shape: Index
+    """(3,) rows, columns, levels."""
+    cell: float
+    level: float
+    origin: Values
+    """(3,) low corner of voxel 0."""
 
 
 def halo_m(params: LowOutliers) -> float:
@@ -128,24 +137,34 @@ def find_levels(blocks: Blocks, points: int, params: LowOutliers) -> Levels:
     """
     columns = _columns(blocks, points, params)
     is_level = _levels(columns, params)
-    return Levels(columns, is_level, _ground(columns, is_level, params) - params.min_depth_m)
+    return Levels(
+        unique=columns.unique,
+        starts=columns.starts,
+        is_level=is_level,
+        floor=_ground(columns, is_level, params) - params.min_depth_m,
+        shape=np.array(columns.shape),
+        cell=columns.cell,
+        level=columns.level,
+        origin=columns.origin,
+    )
 
 
 def is_low_outlier(points: Points, levels: Levels) -> Mask:
     """Say which of some `points` (n, 3) of the cloud are low outliers."""
-    columns = levels.columns
+    rows, columns, heights = levels.shape.tolist()
     is_low = np.zeros(len(points), np.bool_)
 
     def block(start: int, stop: int) -> None:
         keys = np.empty(stop - start, np.int64)
         part = points[start:stop]
-        kernels.voxel_keys(part, columns.origin, columns.cell, columns.level, columns.shape, keys)
+        shape = (rows, columns, heights)
+        kernels.voxel_keys(part, levels.origin, levels.cell, levels.level, shape, keys)
         kernels.mark_low(
             part,
             keys,
-            columns.unique,
-            columns.starts,
-            columns.shape[2],
+            levels.unique,
+            levels.starts,
+            heights,
             levels.is_level,
             levels.floor,
             is_low[start:stop],

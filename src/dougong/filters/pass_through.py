@@ -11,10 +11,11 @@ from pydantic import Field, model_validator
 
 from dougong._checks import as_points
 from dougong.errors import InputError
+from dougong.filters.ranks import ValueBlocks, at_rank, count_finite
 from dougong.filters.selection import Selection
 from dougong.params import Parameters
 from dougong.threads import for_blocks
-from dougong.typing import Mask, Points, Values
+from dougong.typing import Index, Mask, Points, Values
 
 KIND: Literal["local", "two-pass", "global"] = "two-pass"
 
@@ -104,18 +105,33 @@ def robust_top(height_m: Values, layer_m: float = 0.4) -> float:
     above it is a hidden wall under eaves. Finials and antennas count: nothing under them is
     missing.
     """
-    known = height_m[np.isfinite(height_m)]
-    if len(known) == 0:
+    return robust_top_of(lambda: (height_m,), layer_m)
+
+
+def robust_top_of(height_m: ValueBlocks, layer_m: float = 0.4) -> float:
+    """Return the `robust_top` of heights that come in blocks, passed over seven times."""
+    known = count_finite(height_m)
+    if known == 0:
         return float("nan")
-    start = float(np.partition(known, len(known) // 2)[len(known) // 2])
-    above = known[known >= start]
-    layer = np.minimum((above - start) / layer_m, _LAYERS).astype(np.int64)
-    held = np.bincount(layer)
-    beyond = len(above) - np.cumsum(held)
-    is_end = (held < _LAYER_POINTS) & (beyond <= _STRAY_SHARE * len(known))
+    start = at_rank(height_m, known // 2)
+    held = np.zeros(_LAYERS + 1, np.int64)
+    for block in height_m():
+        held += np.bincount(_layers(block, start, layer_m)[1], minlength=len(held))
+    held = held[: int(np.flatnonzero(held)[-1]) + 1]
+    beyond = held.sum() - np.cumsum(held)
+    is_end = (held < _LAYER_POINTS) & (beyond <= _STRAY_SHARE * known)
     last = int(np.argmax(is_end)) if is_end.any() else len(held)
-    below = above[layer < last]
-    return float(below.max()) if len(below) else start
+    top = start
+    for block in height_m():
+        above, layer = _layers(block, start, layer_m)
+        top = max(top, float(above[layer < last].max(initial=start)))
+    return top
+
+
+def _layers(height_m: Values, start: float, layer_m: float) -> tuple[Values, Index]:
+    """Return the known heights from `start` up and the layer that each lies in."""
+    above = height_m[np.isfinite(height_m) & (height_m >= start)]
+    return above, np.minimum((above - start) / layer_m, _LAYERS).astype(np.int64)
 
 
 def _in_range(values: Values, ends: Range | None) -> Mask:
@@ -148,6 +164,7 @@ def pass_through(
     params: PassThrough | None = None,
     *,
     height_above_ground: ArrayLike | None = None,
+    top_m: float | None = None,
 ) -> Selection:
     """Choose the points that meet every condition of `params`.
 
@@ -159,6 +176,8 @@ def pass_through(
     height_above_ground : array_like, shape (n,), optional
         Metres, from the cloth filter; needed by conditions on height. Points where it is unknown
         (NaN) meet those conditions.
+    top_m : float, optional
+        The `robust_top` of the whole cloud, where `points` are a part of it.
 
     Returns
     -------
@@ -192,18 +211,22 @@ def pass_through(
     if height.shape != (len(xyz),):
         raise InputError(f"height_above_ground must have shape ({len(xyz)},), got {height.shape}.")
     is_unknown = np.isnan(height)
-    is_kept &= _in_heights(height, p) | is_unknown
-    unknown = int(is_unknown.sum())
-    notes = (f"{unknown} points have no known ground below and were not cropped by height",)
-    return Selection(is_kept=is_kept, notes=notes if unknown else ())
+    is_kept &= _in_heights(height, p, top_m) | is_unknown
+    return Selection(is_kept=is_kept, notes=unknown_notes(int(is_unknown.sum())))
 
 
-def _in_heights(height: Values, p: PassThrough) -> Mask:
+def unknown_notes(unknown: int) -> tuple[str, ...]:
+    """Return what is to be said of so many points without a height."""
+    note = f"{unknown} points have no known ground below and were not cropped by height"
+    return (note,) if unknown else ()
+
+
+def _in_heights(height: Values, p: PassThrough, top_m: float | None) -> Mask:
     is_in = _in_range(height, p.height_m)
     if p.margin_below_ground_m is not None:
         is_in &= height >= -p.margin_below_ground_m
     if p.margin_above_top_m is not None:
-        top = robust_top(height)
+        top = robust_top(height) if top_m is None else top_m
         if not np.isnan(top):
             is_in &= height <= top + p.margin_above_top_m
     return is_in

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dougong.filters.ranks import ValueBlocks, at_rank
 from dougong.threads import for_blocks
 from dougong.typing import Index, Points, Values
 
@@ -67,6 +68,26 @@ class Taken(IntEnum):
     """It belongs to a group that is smaller than its distance from everything large."""
 
 
+class Whole(NamedTuple):
+    """What the rule must know of a whole cloud to judge a part of it, its halo included."""
+
+    reach_m: float
+    many: int = MANY
+    """Groups of so many points are large (`is_whole` of `_group_margin`)."""
+    is_few: bool = False
+    """So few points that they have no surroundings to be judged by."""
+    own: int = 0
+    """The first so many of the points are the part's own, the others its halo."""
+
+
+class Groups(NamedTuple):
+    """What was found of the groups that own points belong to."""
+
+    has_large: bool
+    most: int
+    """Points of the one with most points."""
+
+
 class Verdict(NamedTuple):
     """What the rule says about n points, in the caller's order."""
 
@@ -78,6 +99,7 @@ class Verdict(NamedTuple):
     """(n,) the spacing of the surface hereabouts, the yardstick."""
     curvature: Values
     """(n,) surface variation of the 12 nearest."""
+    groups: Groups
 
 
 def halo_m(reach_m: float | None) -> float:
@@ -103,16 +125,22 @@ def _reach_of(index: Neighbourhood) -> float:
     from dougong.filters.neighbourhood import blocks_of_leaves, self_knn_block
 
     n = len(index.points)
-    if n <= TESTS:
-        return REACH_M
-    eighth = np.empty(n)
+    eighth = np.full(n, np.inf)
 
     def task(first: int, last: int) -> None:
         start, _, distance2 = self_knn_block(index, TESTS, np.inf, first, last)
         eighth[start : start + len(distance2)] = np.sqrt(distance2[:, -1])
 
-    for_blocks(*blocks_of_leaves(index), task)
-    spacing = float(np.partition(eighth, n // 2)[n // 2]) * math.sqrt(math.pi / TESTS)
+    if n > TESTS:
+        for_blocks(*blocks_of_leaves(index), task)
+    return reach_of(lambda: (eighth,), n)
+
+
+def reach_of(eighth_m: ValueBlocks, points: int) -> float:
+    """Return the reach, metres, of a cloud of so many `points`, by their eighth nearest others."""
+    if points <= TESTS:
+        return REACH_M
+    spacing = at_rank(eighth_m, points // 2) * math.sqrt(math.pi / TESTS)
     reach = REACH_M
     while reach < SPARSE * spacing:
         reach *= 2.0
@@ -149,14 +177,22 @@ def judge(
     gamma: float,
     surface_loss: float,
     reach_m: float | None = None,
+    whole: Whole | None = None,
 ) -> Verdict:
-    """Judge `points` (n, 3), metres; parameters as in `CurvatureWeighted`."""
+    """Judge `points` (n, 3), metres; parameters as in `CurvatureWeighted`.
+
+    Where they are a part of a cloud, `whole` says what it must know of it.
+    """
     from dougong.filters.neighbourhood import build_index
     from dougong.kernels import protective as kernels
 
     index = build_index(points)
-    reach = _reach_of(index) if reach_m is None else reach_m
     n = len(index.points)
+    is_whole = reach_m is None and whole is None
+    if whole is None:
+        reach = _reach_of(index) if reach_m is None else reach_m
+        whole = Whole(reach, is_few=is_whole and n <= TESTS, own=n)
+    reach = whole.reach_m
     places, own = _neighbours(index, reach)
     spacing = local_spacing(index.points, own, reach)
     curvature, frame = np.zeros(n), np.zeros((n, 9), np.float32)
@@ -176,17 +212,16 @@ def judge(
     for_blocks(n, _BLOCK, test)
     reason = np.where(decisive == 1, Taken.OFF_SURFACE, Taken.IN_PAIR).astype(np.uint8)
     reason[~np.isfinite(margin)] = Taken.ALONE
-    lonely = _group_margin(index, places, frame, spacing, GROUP * reach, is_whole=reach_m is None)
+    lonely, groups = _group_margin(index, places, frame, spacing, whole, is_whole=is_whole)
     is_worse = lonely > margin
     margin[is_worse], reason[is_worse] = lonely[is_worse], Taken.SMALL_GROUP
     _excuse_rows(index, spacing, reach, margin)
-    if reach_m is None and n <= TESTS:
-        # So few points have no surroundings to be judged by.
+    if whole.is_few:
         margin[:] = 0.0
     reason[margin <= 1.0] = Taken.KEPT
     back = np.empty(n, np.int64)
     back[index.order] = np.arange(n)
-    return Verdict(margin[back], reason[back], spacing[back], curvature[back])
+    return Verdict(margin[back], reason[back], spacing[back], curvature[back], groups)
 
 
 def _excuse_rows(index: Neighbourhood, spacing: Values, reach: float, margin: Values) -> None:
@@ -299,11 +334,11 @@ def _group_margin(
     places: NDArray[np.int32],
     frame: NDArray[np.float32],
     spacing: Values,
-    limit_m: float,
+    whole: Whole,
     *,
     is_whole: bool,
-) -> Values:
-    """Return gap / size (n,) of each point's group; 0 in a large one.
+) -> tuple[Values, Groups]:
+    """Return gap / size (n,) of each point's group, 0 in a large one, and what groups there are.
 
     Where the points are a whole cloud and no group is large, the one of most points is: a small
     thing alone is what was scanned.
@@ -313,7 +348,7 @@ def _group_margin(
     """
     from dougong.kernels import protective as kernels
 
-    points = index.points
+    points, limit_m = index.points, GROUP * whole.reach_m
     n = len(points)
     parent = np.arange(n)
     kernels.link(points, places, frame, spacing, LINK, parent)
@@ -324,14 +359,16 @@ def _group_margin(
     is_root = held > 0
     longest = np.zeros(n)
     longest[is_root] = (extents[is_root, 3:] - extents[is_root, :3]).max(axis=1)
-    is_large = (longest > limit_m) | (held >= MANY)
+    is_large = (longest > limit_m) | (held >= whole.many)
+    own = parent[index.order < whole.own]
+    groups = Groups(bool(is_large[own].any()), int(held[own].max(initial=0)))
     if is_whole and n and not is_large.any():
         is_large = held == held.max()
     chosen = is_large[parent]
     asked = np.flatnonzero(~chosen)
     margin = np.zeros(n)
     if not len(asked):
-        return margin
+        return margin, groups
     nodes = np.zeros(len(index.boxes), bool)
     kernels.flag_nodes(chosen, nodes)
     gap2 = np.empty(len(asked))
@@ -348,4 +385,4 @@ def _group_margin(
     covered = sums[root] / held[root] * (_SMALLEST_M / _STEPS) * np.sqrt(held[root])
     size = np.maximum(covered, longest[root])
     margin[asked] = gap[root] / size
-    return margin
+    return margin, groups

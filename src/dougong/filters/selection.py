@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from dougong.typing import Mask
@@ -44,3 +45,25 @@ class Selection:
     """(n,) arrays that the filter worked out on the way (curvature, height_above_ground ...)."""
     notes: tuple[str, ...] = ()
     """What the user should know, in words and counted."""
+
+
+DETAIL, MARGIN = "dougong_detail", "dougong_margin"
+MARGIN_MOST = 1e6
+"""Margins are written as at most this: a point alone has an infinite one."""
+
+
+def details_of(selection: Selection) -> dict[str, NDArray[Any]]:
+    """Return what a selection says of its points besides its choice, as it is written."""
+    details: dict[str, NDArray[Any]] = {}
+    for given, name, dtype in (
+        ("removal_reason", DETAIL, np.uint8),
+        ("removal_margin", MARGIN, np.float32),
+    ):
+        if given not in selection.attributes:
+            continue
+        values = np.minimum(selection.attributes[given], MARGIN_MOST).astype(dtype)
+        if name == MARGIN:
+            # In single precision too a removed point is above 1.
+            values[~selection.is_kept & (values <= 1)] = np.nextafter(np.float32(1), dtype(2))
+        details[name] = values
+    return details

@@ -3,18 +3,20 @@
 METHOD.md 1.4 (Rusu et al. 2008). Kernels are imported when called.
 """
 
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from dougong._checks import as_points
+from dougong.filters.ranks import ValueBlocks, at_rank, count_finite
 from dougong.filters.selection import Selection
 from dougong.filters.totals import LARGEST, Totals
 from dougong.params import Parameters
 from dougong.threads import for_blocks
-from dougong.typing import Points, Values
+from dougong.typing import Index, Points, Values
 
 KIND: Literal["local", "two-pass", "global"] = "two-pass"
 
@@ -78,20 +80,30 @@ def mean_distances(points: ArrayLike, params: Statistical) -> Values:
 
 
 def _mean_of_nearest(xyz: Points, k: int) -> Values:
+    return nearest_distances(xyz, k)[0]
+
+
+def nearest_distances(xyz: Points, k: int) -> tuple[Values, Values]:
+    """Return mean and largest (n,) of the distances to the k nearest others; inf with fewer."""
     from dougong.filters.neighbourhood import blocks_of_leaves, build_index, self_knn_block
 
     index = build_index(xyz)
-    result = np.full(len(xyz), np.inf)
+    mean, largest = np.full(len(xyz), np.inf), np.full(len(xyz), np.inf)
 
     def task(first: int, last: int) -> None:
         start, _, distance2 = self_knn_block(index, k, np.inf, first, last)
         rows = index.order[start : start + len(distance2)]
-        # Rows are sorted by distance, so the sum does not depend on the order of the points.
-        result[rows] = np.sqrt(distance2).sum(axis=1) / k
+        mean[rows], largest[rows] = mean_and_largest(np.sqrt(distance2))
 
     if len(xyz) > 1:
         for_blocks(*blocks_of_leaves(index), task)
-    return result
+    return mean, largest
+
+
+def mean_and_largest(distance_m: NDArray[np.float64]) -> tuple[Values, Values]:
+    """Return mean (n,) and largest (n,) of (n, k) distances, ascending in every row."""
+    # Rows are sorted by distance, so the sum does not depend on the order of the points.
+    return distance_m.sum(axis=1) / distance_m.shape[1], distance_m[:, -1]
 
 
 def _mean_within(xyz: Points, radius_m: float) -> Values:
@@ -123,21 +135,27 @@ def _mean_within(xyz: Points, radius_m: float) -> Values:
     return result
 
 
-def cut_distance(mean_m: Values, multiplier: float) -> tuple[float, int]:
+def cut_distance(mean_m: ValueBlocks, multiplier: float) -> tuple[float, int]:
     """Return the cut mu + multiplier x sigma, metres, and how many points stayed out of the sums.
 
-    Out of the sums stay points without a neighbour, and strays at more than 1000 medians: one point
-    at 1e6 m would otherwise raise sigma so far that nothing else is ever removed.
+    Of the mean distances of a whole cloud, which come in blocks. Out of the sums stay points
+    without a neighbour, and strays at more than 1000 medians: one point at 1e6 m would otherwise
+    raise sigma so far that nothing else is ever removed.
     """
-    steps = np.minimum(mean_m / _STEP_M, LARGEST).round()
-    counted = steps[np.isfinite(mean_m)].astype(np.int64)
-    if len(counted) == 0:
-        return 0.0, len(mean_m)
-    median = int(np.partition(counted, len(counted) // 2)[len(counted) // 2])
-    if median > 0:
-        counted = counted[counted <= _STRAY * median]
-    totals = Totals.of(counted)
-    return (totals.mean + multiplier * totals.deviation) * _STEP_M, len(mean_m) - len(counted)
+    points = sum(len(block) for block in mean_m())
+    counted = count_finite(mean_m)
+    if counted == 0:
+        return 0.0, points
+    median = int(_steps(np.array([at_rank(mean_m, counted // 2)]))[0])
+    totals = Totals()
+    for block in mean_m():
+        steps = _steps(block[np.isfinite(block)])
+        totals += Totals.of(steps[steps <= _STRAY * median] if median > 0 else steps)
+    return (totals.mean + multiplier * totals.deviation) * _STEP_M, points - totals.count
+
+
+def _steps(mean_m: Values) -> Index:
+    return np.minimum(mean_m / _STEP_M, LARGEST).round().astype(np.int64)
 
 
 def statistical(points: ArrayLike, params: Statistical | None = None) -> Selection:
@@ -161,13 +179,21 @@ def statistical(points: ArrayLike, params: Statistical | None = None) -> Selecti
     """
     params = params or Statistical()
     mean_m = mean_distances(points, params)
-    cut, strays = cut_distance(mean_m, params.multiplier)
+    cut, strays = cut_distance(lambda: (mean_m,), params.multiplier)
+    return replace(select_near(mean_m, cut), notes=stray_notes(strays))
+
+
+def select_near(mean_m: Values, cut: float) -> Selection:
+    """Choose the points whose mean distance (n,) does not exceed the cut of the whole cloud."""
     # Half a step above: a point exactly at the cut stays, whatever its last digit.
     limit = cut + 0.5 * _STEP_M
-    is_kept = mean_m <= limit
-    notes = (f"{strays} points lie far from all others and do not count for the mean",)
     return Selection(
-        is_kept=is_kept,
+        is_kept=mean_m <= limit,
         attributes={"mean_distance_m": mean_m, "removal_margin": mean_m / limit},
-        notes=notes if strays else (),
     )
+
+
+def stray_notes(strays: int) -> tuple[str, ...]:
+    """Return what is to be said of so many strays."""
+    note = f"{strays} points lie far from all others and do not count for the mean"
+    return (note,) if strays else ()

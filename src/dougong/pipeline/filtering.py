@@ -1,13 +1,14 @@
 """``dougong filter``: one file through a recipe or one filter, with its books beside it."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dougong.cloud import Cloud
+from dougong.cloud import Cloud, Pieces
 from dougong.errors import InputError
-from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
 from dougong.filters.selection import Reason
 from dougong.formats import (
     describe,
@@ -15,9 +16,10 @@ from dougong.formats import (
     read,
     write,
 )
+from dougong.formats.model import Hold
 from dougong.params import Parameters
 from dougong.pipeline.marking import GROUND_CLASS, marked, with_classes
-from dougong.pipeline.memory import Room, refuse_too_large
+from dougong.pipeline.memory import Room
 from dougong.pipeline.outputs import refuse_output, watched, write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import Clock, peak_memory_bytes, sha256, software
@@ -26,19 +28,27 @@ from dougong.pipeline.recipes import (
     PhotogrammetryRecipe,
     Recipe,
     filter_cloud,
-    lidar_after_grid,
+    steps_of,
 )
 from dougong.pipeline.registrations import finite
 from dougong.pipeline.removed import detail_counts
 from dougong.pipeline.settings import parse_overrides, updated
-from dougong.pipeline.single import filter_name, filter_single, single_fields, single_parameters
-from dougong.pipeline.steps import Filtered
+from dougong.pipeline.single import (
+    filter_name,
+    filter_single,
+    single_fields,
+    single_parameters,
+    single_steps,
+)
+from dougong.pipeline.steps import GROUND, Filtered
+from dougong.pipeline.store import Books
 from dougong.pipeline.tiled import (
-    FilteredOnTiles,
-    GridFirst,
+    TiledJob,
     filter_chunks,
+    forget_tiles,
     is_too_large,
     stations_of,
+    tiled_job,
 )
 from dougong.typing import Kind
 
@@ -61,16 +71,13 @@ class FilterJob:
         recipe = Recipe().model_copy(update={self.kind: self.params})
         return filter_cloud(cloud, self.kind, recipe, progress)
 
-    def grid_first(self) -> GridFirst | None:
-        """Return the job as tiles can do it, or None where it does not begin with a voxel grid."""
-        if isinstance(self.params, OctreeVoxelGrid):
-            return GridFirst(grid=self.params, after=lambda _: None)
-        if self.only is None and isinstance(self.params, LidarRecipe):
-            recipe = self.params
-            return GridFirst(
-                grid=recipe.octree_voxel_grid, after=lambda bench: lidar_after_grid(bench, recipe)
-            )
-        return None
+    def tiled(self) -> TiledJob:
+        """Return the job as tiles do it."""
+        if self.only is not None:
+            return tiled_job(single_steps(self.only, self.params))
+        assert self.kind is not None
+        recipe = Recipe().model_copy(update={self.kind: self.params})
+        return tiled_job(steps_of(self.kind, recipe))
 
 
 def filter_job(kind: Kind | None, only: str | None, settings: Sequence[str]) -> FilterJob:
@@ -129,49 +136,82 @@ def filter_file(
     progress.stage(f"reading {input.name}")
     with clock.measure("read"):
         digest = sha256(input)
-    room, tiled = Room.of(memory_bytes), job.grid_first()
-    if tiled is not None and not mark and is_too_large(input, room, 0):
-        progress.note(f"{input.name} is larger than memory: its voxel grid runs on tiles")
-        with clock.measure("filter"):
-            found = _filtered_on_tiles(input, tiled, room, output.parent, progress)
-        filtered, noticed, result = found.filtered, found.notes, found.filtered.cloud
-    else:
-        refuse_too_large([input], memory_bytes)
-        with clock.measure("read"):
-            cloud = read(input)
-            noticed = (*cloud.notes, *faults_of(cloud))
-        with clock.measure("filter"):
-            filtered = job.run(cloud, progress)
-        result = _chosen(job, cloud, filtered, mark)
-    progress.stage(f"writing {output.name}")
-    with watched(output, books):
-        with clock.measure("write"):
-            written = write(result, output, overwrite=overwrite)
-        notes = [*noticed, *filtered.notes, *written.notes]
-        document = {
-            "input": {"path": str(input), "sha256": digest, "points": len(filtered.codes)},
-            "output": str(output),
-            **_filter_document(job, filtered, result, mark),
-            "notes": notes,
-            "seconds": {**clock.seconds, "total": clock.total()},
-            "peak_memory_bytes": peak_memory_bytes(),
-            "software": software(),
-        }
-        cleaned: Document = finite(document)
-        write_json(books, cleaned)
+    room = Room.of(memory_bytes)
+    with _scratch(output) as scratch:
+        result: Cloud | Pieces
+        hold: Hold | None = None
+        filtered: Filtered | Books
+        if is_too_large(input, room, 0):
+            progress.note(f"{input.name} is larger than memory: it is filtered on tiles")
+            with clock.measure("filter"):
+                filtered = _filtered_on_tiles(input, job, room, scratch, progress)
+            forget_tiles(scratch)
+            noticed = filtered.noticed
+            hold = Hold(room.tile_points(len(filtered.codes), 0), output.parent)
+            result = _pieces(input, job, filtered, mark)
+        else:
+            with clock.measure("read"):
+                cloud = read(input)
+                noticed = (*cloud.notes, *faults_of(cloud))
+            with clock.measure("filter"):
+                filtered = job.run(cloud, progress)
+            result = _chosen(job, cloud, filtered, mark)
+        progress.stage(f"writing {output.name}")
+        with watched(output, books):
+            with clock.measure("write"):
+                written = write(result, output, overwrite=overwrite, hold=hold)
+            notes = [*noticed, *filtered.notes, *written.notes]
+            document = {
+                "input": {"path": str(input), "sha256": digest, "points": len(filtered.codes)},
+                "output": str(output),
+                **_filter_document(job, filtered, written.points, mark),
+                "notes": notes,
+                "seconds": {**clock.seconds, "total": clock.total()},
+                "peak_memory_bytes": peak_memory_bytes(),
+                "software": software(),
+            }
+            cleaned: Document = finite(document)
+            write_json(books, cleaned)
     return cleaned
 
 
-def _filter_document(job: FilterJob, filtered: Filtered, result: Cloud, mark: bool) -> Document:
+@contextmanager
+def _scratch(output: Path) -> Iterator[Path]:
+    """Yield a folder beside `output` that may be made, and is gone afterwards."""
+    folder = output.with_name(f"tiles-{output.name}-{os.getpid()}")
+    try:
+        yield folder
+    finally:
+        forget_tiles(folder)
+
+
+def _pieces(input: Path, job: FilterJob, books: Books, mark: bool) -> Pieces:
+    """Return what is written of a cloud that was filtered on tiles, as it is decoded again."""
+
+    def pieces() -> Iterator[Cloud]:
+        done = 0
+        (chunks,) = stations_of(input, split=False)
+        for chunk in chunks:
+            here = slice(done, done + len(chunk))
+            done += len(chunk)
+            yield _chosen(job, chunk, books.part(chunk, here), mark)
+
+    return pieces
+
+
+def _filter_document(
+    job: FilterJob, filtered: Filtered | Books, written: int, mark: bool
+) -> Document:
     """Return what the books say of the filter: counts per stage, reasons, parameters."""
-    points_in, points_kept = len(filtered.codes), len(filtered.cloud)
+    is_kept = filtered.codes == Reason.KEPT
+    points_in, points_kept = len(is_kept), int(is_kept.sum())
     return {
         "kind": job.kind,
         "only": job.only,
         "is_marked": mark,
         "points_in": points_in,
         "points_kept": points_kept,
-        "points_written": len(result),
+        "points_written": written,
         "reduction": 1.0 - points_kept / points_in,
         "stages": [
             {
@@ -184,18 +224,18 @@ def _filter_document(job: FilterJob, filtered: Filtered, result: Cloud, mark: bo
             for stage in filtered.stages
         ],
         "reasons": reason_table(filtered),
-        "ground_points": int(filtered.is_ground.sum()),
+        "ground_points": int((is_kept & (filtered.ground_class == GROUND)).sum()),
         "parameters": job.params.model_dump(mode="json"),
     }
 
 
 def _filtered_on_tiles(
-    input: Path, job: GridFirst, room: Room, scratch: Path, progress: Progress
-) -> FilteredOnTiles:
+    input: Path, job: FilterJob, room: Room, scratch: Path, progress: Progress
+) -> Books:
     (chunks,) = stations_of(input, split=False)
     return filter_chunks(
         chunks,
-        job,
+        job.tiled(),
         points=describe(input).points,
         room=room,
         waiting=0,
@@ -204,7 +244,7 @@ def _filtered_on_tiles(
     )
 
 
-def reason_table(filtered: Filtered) -> dict[str, dict[str, Any]]:
+def reason_table(filtered: Filtered | Books) -> dict[str, dict[str, Any]]:
     """Return per reason its code in ``dougong_reason`` and the points it took, in detail too."""
     table: dict[str, dict[str, Any]] = {}
     for reason in Reason:

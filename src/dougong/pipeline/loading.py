@@ -16,16 +16,16 @@ from dougong.pipeline.memory import Room
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Entry, files_of
 from dougong.pipeline.provenance import Clock, sha256
-from dougong.pipeline.recipes import Recipe, filter_cloud, lidar_after_grid
+from dougong.pipeline.recipes import Recipe, filter_cloud, steps_of
 from dougong.pipeline.removed import removed_sample
 from dougong.pipeline.steps import Filtered
 from dougong.pipeline.store import Store
 from dougong.pipeline.tiled import (
-    GridFirst,
     filter_chunks,
     is_too_large,
     left_of,
     stations_of,
+    tiled_job,
     undecimated,
 )
 from dougong.registration.free_scale import ScaleSearch, with_unit, without_unit
@@ -162,7 +162,7 @@ class Loader:
         waiting = sum(self.held.values())
         if entry.name in self.units and self.units[entry.name] is None:
             found = self._unfiltered(entry, file)
-        elif entry.kind == "lidar" and is_too_large(file, self.room, waiting):
+        elif is_too_large(file, self.room, waiting):
             found = self._on_tiles(entry, file, digest)
         else:
             found = self._whole(entry, file, digest)
@@ -219,37 +219,42 @@ class Loader:
             yield self._source(entry, file, station, filtered, noticed, removed)
 
     def _on_tiles(self, entry: Entry, file: Path, digest: str) -> Iterator[Source]:
-        """Filter the clouds of a file that does not fit in memory."""
-        self.progress.note(f"{file.name} is larger than memory: its voxel grid runs on tiles")
-        recipe = self.recipe.lidar
-        job = GridFirst(
-            grid=recipe.octree_voxel_grid, after=lambda bench: lidar_after_grid(bench, recipe)
-        )
+        """Filter the clouds of a file that does not fit in memory, then read what is left."""
+        self.progress.note(f"{file.name} is larger than memory: it is filtered on tiles")
+        job = tiled_job(steps_of(entry.kind, self.recipe))
         points = describe(file).points
         for station, raw in enumerate(stations_of(file, split=not entry.registered)):
-            chunks = (self._placed(entry, chunk) for chunk in raw)
             key = self._key(entry, digest, station)
-            books = self.store.load(key)
-            if books is not None:
-                thinned, codes = undecimated(chunks, books.codes)
-                self._say_known(thinned.name)
-                filtered = books.on(thinned.select(np.flatnonzero(codes == Reason.KEPT)))
-                details = left_of(books.details, books.codes)
-                removed = removed_sample(thinned, codes, details=details)
-                yield self._source(entry, file, station, filtered, books.noticed, removed)
+            if self.store.load(key) is not None:
+                self._say_known(file.stem)
                 continue
             with self.clock.measure("filter"):
-                found = filter_chunks(
-                    chunks,
+                books = filter_chunks(
+                    (self._placed(entry, chunk) for chunk in raw),
                     job,
                     points=points,
                     room=self.room,
                     waiting=sum(self.held.values()),
-                    scratch=self.store.folder,
+                    scratch=self.store.folder / f"tiles-{self._tiles_key(entry, digest, station)}",
                     progress=self.progress,
+                    is_kept_in_memory=True,
                 )
-            self.store.save(key, found.filtered, found.notes)
-            yield self._source(entry, file, station, found.filtered, found.notes, found.removed)
+            self.store.save(key, books, books.noticed)
+        for station, raw in enumerate(stations_of(file, split=not entry.registered)):
+            known = self.store.load(self._key(entry, digest, station))
+            assert known is not None
+            with self.clock.measure("read"):
+                chunks = (self._placed(entry, chunk) for chunk in raw)
+                thinned, codes = undecimated(chunks, known.codes)
+            filtered = known.on(thinned.select(np.flatnonzero(codes == Reason.KEPT)))
+            removed = removed_sample(thinned, codes, details=left_of(known.details, known.codes))
+            yield self._source(entry, file, station, filtered, known.noticed, removed)
+
+    def _tiles_key(self, entry: Entry, digest: str, station: int) -> str:
+        """Return the name of the tiles: a hash of what they depend on, not of later filters."""
+        grid = tiled_job(steps_of(entry.kind, self.recipe)).grid
+        facts = f"{digest} for {entry.kind} in {self.room.bytes:.0f}"
+        return self.store.key(facts, station, entry.kind, grid or Recipe())[:16]
 
     def _key(self, entry: Entry, digest: str, station: int) -> str:
         params = self.recipe.lidar if entry.kind == "lidar" else self.recipe.photogrammetry

@@ -15,8 +15,8 @@ BASE_BYTES = 800_000_000
 BYTES_PER_POINT = 230
 BYTES_PER_WAITING_POINT = 110
 _BYTES_PER_TILE_POINT = 250
-_BYTES_PER_BOOKED_POINT = 2
-"""Of a cloud on tiles, only the reason and the ground class of every point are held."""
+_BYTES_PER_BOOKED_POINT = 7
+"""Of a cloud on tiles, the reason, the ground class and the details of every point are held."""
 _LEAST_TILE_POINTS = 100_000
 _MOST_TILE_POINTS = 20_000_000
 """Larger tiles gain nothing."""

@@ -137,10 +137,9 @@ def _planned(
     way: Way = "in memory"
     tile_points, refusal = None, None
     if not room.holds(told.points, waiting):
-        way = "on tiles" if entry.kind == "lidar" else "too large"
         most = room.most_tile_points(told.points, waiting)
-        if way == "on tiles" and most is not None:
-            tile_points = most
+        if most is not None:
+            way, tile_points = "on tiles", most
         else:
             way = "too large"
             need = estimated_bytes([told.points, waiting])

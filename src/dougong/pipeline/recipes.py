@@ -20,17 +20,7 @@ from dougong.filters.statistical import Statistical
 from dougong.formats import require_metric
 from dougong.params import Parameters
 from dougong.pipeline.progress import Progress, Silent
-from dougong.pipeline.steps import (
-    GROUND,
-    Bench,
-    Filtered,
-    run_cloth,
-    run_curvature_weighted,
-    run_low_outliers,
-    run_octree_voxel_grid,
-    run_pass_through,
-    run_statistical,
-)
+from dougong.pipeline.steps import Bench, Filtered, Step, run_step
 from dougong.typing import Kind
 
 
@@ -108,31 +98,26 @@ def filter_cloud(
         raise InputError(msg)
     recipe = params or Recipe()
     bench = Bench(cloud, progress or Silent())
-    if kind == "lidar":
-        _lidar(bench, recipe.lidar)
-    else:
-        _photogrammetry(bench, recipe.photogrammetry)
+    for step in steps_of(kind, recipe):
+        run_step(bench, step)
     return bench.result()
 
 
-def _lidar(bench: Bench, recipe: LidarRecipe) -> None:
-    run_octree_voxel_grid(bench, recipe.octree_voxel_grid)
-    lidar_after_grid(bench, recipe)
-
-
-def lidar_after_grid(bench: Bench, recipe: LidarRecipe) -> None:
-    """Run what follows the voxel grid on a laser scan's decimated points."""
-    run_low_outliers(bench, recipe.low_outliers)
-    run_cloth(bench, recipe.cloth_simulation)
-    left = bench.left()
-    run_curvature_weighted(
-        bench, recipe.curvature_weighted, among=left[bench.ground_class[left] != GROUND]
+def steps_of(kind: Kind, recipe: Recipe) -> tuple[Step, ...]:
+    """Return the filters of a sensor in order, whether in memory or on tiles."""
+    if kind == "photogrammetry":
+        flight = recipe.photogrammetry
+        return (
+            Step("statistical", flight.statistical),
+            Step("low_outliers", flight.low_outliers),
+            Step("cloth_simulation", flight.cloth_simulation),
+            Step("pass_through", flight.pass_through),
+        )
+    scan = recipe.lidar
+    return (
+        Step("octree_voxel_grid", scan.octree_voxel_grid),
+        Step("low_outliers", scan.low_outliers),
+        Step("cloth_simulation", scan.cloth_simulation),
+        Step("curvature_weighted", scan.curvature_weighted, "off_ground"),
+        Step("pass_through", scan.pass_through),
     )
-    run_pass_through(bench, recipe.pass_through)
-
-
-def _photogrammetry(bench: Bench, recipe: PhotogrammetryRecipe) -> None:
-    run_statistical(bench, recipe.statistical)
-    run_low_outliers(bench, recipe.low_outliers)
-    run_cloth(bench, recipe.cloth_simulation)
-    run_pass_through(bench, recipe.pass_through)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from dougong.cloud import Cloud
 from dougong.filters.protective import Taken
-from dougong.filters.selection import Reason
+from dougong.filters.selection import DETAIL, Reason
 from dougong.formats.faults import coordinate_hashes
-from dougong.pipeline.steps import DETAIL, Filtered
+from dougong.pipeline.steps import Filtered
 
 MOST = 100_000
 """Removed points of one file (or station) that are kept for looking."""

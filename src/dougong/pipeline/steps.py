@@ -1,9 +1,9 @@
 """Filters applied in turn to one cloud, with a book of what each took and why."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,15 +16,18 @@ from dougong.filters.low_outliers import LowOutliers, low_outliers
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid
 from dougong.filters.pass_through import PassThrough, pass_through
 from dougong.filters.radius import Radius, radius
-from dougong.filters.selection import NOISE, Reason, Selection
+from dougong.filters.selection import (
+    NOISE,
+    Reason,
+    Selection,
+    details_of,
+)
 from dougong.filters.statistical import Statistical, statistical
+from dougong.params import Parameters
 from dougong.pipeline.progress import Progress
 from dougong.typing import Index, Mask, Values
 
 UNKNOWN, NOT_GROUND, GROUND = 0, 1, 2
-DETAIL, MARGIN = "dougong_detail", "dougong_margin"
-MARGIN_MOST = 1e6
-"""Margins are written as at most this: a point alone has an infinite one."""
 _MUCH_NOISE = 0.2
 """A filter that takes more than this share of what it sees for noise is doubted."""
 
@@ -65,6 +68,15 @@ class Filtered:
         """(k,) over the kept points: True on the ground."""
         ground: Mask = self.ground_class[self.codes == Reason.KEPT] == GROUND
         return ground
+
+
+class Step(NamedTuple):
+    """One filter of a recipe, in memory or on tiles."""
+
+    name: str
+    params: Parameters
+    among: Literal["left", "off_ground"] = "left"
+    """Which points it judges: all that are left, or of these those that are not ground."""
 
 
 @dataclass(slots=True)
@@ -113,23 +125,14 @@ class Bench:
                 seconds=time.perf_counter() - start,
             )
         )
-        said = [*selection.notes, *_doubts(reason, taken, len(asked))]
+        said = [*selection.notes, *doubts(reason, taken, len(asked))]
         self.notes += [f"{self.cloud.name}, {name}: {note}" for note in said]
         return selection
 
     def _book_details(self, selection: Selection, asked: Index) -> None:
-        for given, name, dtype in (
-            ("removal_reason", DETAIL, np.uint8),
-            ("removal_margin", MARGIN, np.float32),
-        ):
-            if given not in selection.attributes:
-                continue
+        for name, values in details_of(selection).items():
             if name not in self.details:
-                self.details[name] = np.zeros(len(self.cloud), dtype)
-            values = np.minimum(selection.attributes[given], MARGIN_MOST).astype(dtype)
-            if name == MARGIN:
-                # In single precision too a removed point is above 1.
-                values[~selection.is_kept & (values <= 1)] = np.nextafter(np.float32(1), dtype(2))
+                self.details[name] = np.zeros(len(self.cloud), values.dtype)
             self.details[name][asked] = values
 
     def result(self) -> Filtered:
@@ -142,13 +145,7 @@ class Bench:
         """
         left = self.left()
         if len(left) == 0:
-            msg = (
-                f"{self.cloud.name}: the filters kept none of {len(self.cloud)} points. "
-                "Look at the stage that took them all and loosen it: "
-                + ", ".join(f"{stage.name} {stage.points_out}" for stage in self.stages)
-                + "."
-            )
-            raise InputError(msg)
+            raise InputError(nothing_kept(self.cloud.name, len(self.cloud), self.stages))
         return Filtered(
             cloud=self.cloud.select(left),
             codes=self.codes,
@@ -159,7 +156,17 @@ class Bench:
         )
 
 
-def _doubts(reason: Reason, taken: int, asked: int) -> list[str]:
+def nothing_kept(name: str, points: int, stages: Sequence[StageCount]) -> str:
+    """Return what is said where no point is left."""
+    return (
+        f"{name}: the filters kept none of {points} points. "
+        "Look at the stage that took them all and loosen it: "
+        + ", ".join(f"{stage.name} {stage.points_out}" for stage in stages)
+        + "."
+    )
+
+
+def doubts(reason: Reason, taken: int, asked: int) -> list[str]:
     """Return what is to be said where more was taken for noise than a survey ever holds."""
     if reason not in NOISE or taken <= _MUCH_NOISE * asked:
         return []
@@ -248,3 +255,24 @@ def run_pass_through(bench: Bench, params: PassThrough) -> None:
             height_above_ground=None if heights is None else heights[index],
         ),
     )
+
+
+_RUN: dict[str, Callable[[Bench, Any], None]] = {
+    "octree_voxel_grid": run_octree_voxel_grid,
+    "low_outliers": run_low_outliers,
+    "cloth_simulation": run_cloth,
+    "curvature_weighted": run_curvature_weighted,
+    "statistical": run_statistical,
+    "radius": run_radius,
+    "pass_through": run_pass_through,
+}
+
+
+def run_step(bench: Bench, step: Step) -> None:
+    """Run one filter of a recipe."""
+    if step.among == "left":
+        _RUN[step.name](bench, step.params)
+        return
+    assert isinstance(step.params, CurvatureWeighted)
+    left = bench.left()
+    run_curvature_weighted(bench, step.params, left[bench.ground_class[left] != GROUND])

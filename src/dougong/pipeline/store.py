@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 import dougong
 from dougong.cloud import Cloud
 from dougong.errors import OutputError
+from dougong.filters.selection import Reason
 from dougong.params import Parameters
 from dougong.pipeline.outputs import write_text
 from dougong.pipeline.steps import Filtered, StageCount
@@ -39,6 +40,18 @@ class Books:
     noticed: tuple[str, ...]
     """What reading the input said."""
     details: Mapping[str, NDArray[Any]]
+
+    def part(self, cloud: Cloud, rows: slice) -> Filtered:
+        """Return the finished step on a part of its input: `cloud` has its points of `rows`."""
+        codes = self.codes[rows]
+        return Filtered(
+            cloud=cloud.select(np.flatnonzero(codes == Reason.KEPT)),
+            codes=codes,
+            ground_class=self.ground_class[rows],
+            stages=self.stages,
+            notes=self.notes,
+            details={name: values[rows] for name, values in self.details.items()},
+        )
 
     def on(self, kept: Cloud) -> Filtered:
         """Return the finished step with the points that it kept."""
@@ -84,7 +97,7 @@ class Store:
             details=details,
         )
 
-    def save(self, key: str, filtered: Filtered, noticed: Sequence[str]) -> None:
+    def save(self, key: str, filtered: Filtered | Books, noticed: Sequence[str]) -> None:
         """Keep a finished step.
 
         Raises

@@ -1,17 +1,16 @@
-"""Filtering a laser scan that does not fit in memory.
+"""Filtering a cloud that does not fit in memory: every filter runs on tiles on disk.
 
-The voxel grid runs on tiles, the other filters on what it leaves. The result is that of the whole
-cloud, point by point.
+The result is that of the whole cloud, point by point.
 """
 
 from __future__ import annotations
 
+import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -19,38 +18,45 @@ from numpy.typing import NDArray
 
 from dougong.cloud import Cloud
 from dougong.errors import InputError
+from dougong.filters import FILTERS
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
-from dougong.filters.selection import Reason
+from dougong.filters.pass_through import PassThrough
+from dougong.filters.selection import DETAIL, MARGIN, Reason
 from dougong.formats import describe, iterate, require_metric
 from dougong.pipeline.memory import Room
 from dougong.pipeline.progress import Progress
-from dougong.pipeline.removed import removed_sample
-from dougong.pipeline.steps import Bench, Filtered, StageCount
-from dougong.tiles.decimate import Decimated, Spool, decimate
+from dougong.pipeline.steps import StageCount, Step, doubts, nothing_kept
+from dougong.pipeline.store import Books
+from dougong.tiles.cloud import POINTS, TiledCloud, load_tiles, read_arrays
+from dougong.tiles.engine import local_engine
+from dougong.tiles.partition import partition
+from dougong.tiles.spool import Spool
+from dougong.tiles.stages import TileBench
+from dougong.tiles.work import state_of
 
 CHUNK_POINTS = 1_000_000
 _LEAST_BYTES_PER_POINT = 4
 """No format packs points of a real scan into less."""
+_HALO_SHARE = 3
+"""A tile holds at most this share of the points that fit: the others are for its halo."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GridFirst:
-    """A job that begins with the voxel grid: what tiles can do."""
+class TiledJob:
+    """Filters as tiles do them."""
 
-    grid: OctreeVoxelGrid
-    after: Callable[[Bench], None]
-    """The filters behind it, on the points that it leaves."""
+    grid: OctreeVoxelGrid | None
+    """The voxel grid that comes first; None: every point goes on."""
+    steps: tuple[Step, ...]
+    """The filters behind it, in order."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FilteredOnTiles:
-    """A filtered cloud, and what was noticed on the way."""
-
-    filtered: Filtered
-    notes: tuple[str, ...]
-    """Of the reader, then the faults that were handled."""
-    removed: Cloud
-    """A sample of what was taken out, see `removed_sample`."""
+def tiled_job(steps: Sequence[Step]) -> TiledJob:
+    """Return the filters of a recipe as tiles do them."""
+    first = steps[0].params if steps else None
+    if isinstance(first, OctreeVoxelGrid):
+        return TiledJob(grid=first, steps=tuple(steps[1:]))
+    return TiledJob(grid=None, steps=tuple(steps))
 
 
 def is_too_large(file: Path, room: Room, waiting: int) -> bool:
@@ -106,50 +112,132 @@ def _marked_with_station(chunks: Iterator[Cloud], file: Path) -> Iterator[Cloud]
 
 def filter_chunks(
     chunks: Iterator[Cloud],
-    job: GridFirst,
+    job: TiledJob,
     *,
     points: int,
     room: Room,
     waiting: int,
     scratch: Path,
     progress: Progress,
-) -> FilteredOnTiles:
-    """Filter a cloud that comes in `chunks` without ever holding it.
+    is_kept_in_memory: bool = False,
+) -> Books:
+    """Filter a cloud that comes in `chunks` without ever holding it; return the books of it.
 
     Parameters
     ----------
     chunks : iterator of Cloud
         In one frame.
-    job : GridFirst
+    job : TiledJob
     points : int
         At most so many come.
     room : Room
     waiting : int
         Points of clouds that are held meanwhile.
     scratch : Path
-        Gets a temporary folder with the cloud in it, once as decoded and once in tiles.
+        Gets the cloud, once as decoded and once in tiles. Tiles that an earlier run left there
+        are gone on with.
     progress : Progress
+    is_kept_in_memory : bool
+        What is left will be held: refuse early what does not fit.
 
     Raises
     ------
     InputError
-        Even tiles do not fit, or what the grid leaves does not.
-    FormatError, OutputError
-        The file cannot be read, `scratch` cannot be written (a full disk).
+        Even tiles do not fit, what the voxel grid leaves does not, or no point is left.
+    FormatError, OutputError, TileError
+        The file cannot be read, `scratch` cannot be written (a full disk), a tile failed.
     """
     most = room.tile_points(points, waiting)
-    decimated, seconds = _decimated(chunks, job.grid, most, scratch, progress)
-    room.refuse_kept(len(decimated.cloud), waiting, decimated.cloud.name)
-    filtered = _finished(decimated, seconds, job.after, progress)
-    return FilteredOnTiles(
-        filtered=filtered,
-        removed=removed_sample(
-            decimated.cloud,
-            filtered.codes[decimated.row],
-            details={name: values[decimated.row] for name, values in filtered.details.items()},
-        ),
-        notes=(*decimated.cloud.notes, *decimated.faults),
+    start = time.perf_counter()
+    tiles = load_tiles(scratch)
+    if tiles is None:
+        tiles = _cut(chunks, job, most, scratch, progress)
+    name = tiles.facts["name"]
+    if is_kept_in_memory:
+        room.refuse_kept(tiles.points, waiting, name)
+    stages = [_grid_stage(tiles, time.perf_counter() - start)] if job.grid is not None else []
+    notes: list[str] = []
+    with local_engine() as engine:
+        bench = TileBench(tiles, engine)
+        for step in job.steps:
+            progress.stage(f"{name}: {step.name.replace('_', ' ')} on tiles")
+            params = step.params
+            if isinstance(params, PassThrough):
+                params = params.shifted(tiles.facts["origin"])
+            done = bench.apply(step.name, params, step.among)
+            said = [*done.notes, *doubts(FILTERS[step.name].reason, done.taken, done.asked)]
+            notes += [f"{name}, {step.name}: {note}" for note in said]
+            stages.append(
+                StageCount(
+                    name=step.name,
+                    points_in=done.left,
+                    points_out=done.left - done.taken,
+                    seconds=done.seconds,
+                )
+            )
+    if stages and not stages[-1].points_out:
+        raise InputError(nothing_kept(name, tiles.facts["points_in"], stages))
+    noticed = (*tiles.facts["notes"], *tiles.facts["faults"])
+    return _books(bench, tuple(stages), tuple(notes), noticed)
+
+
+def _cut(
+    chunks: Iterator[Cloud], job: TiledJob, most: int, scratch: Path, progress: Progress
+) -> TiledCloud:
+    """Write the cloud to `scratch`, thin it where the job begins with a grid, and cut it."""
+    # What a killed run left is of no use before its last file, the list of tiles.
+    shutil.rmtree(scratch, ignore_errors=True)
+    spool = Spool(chunks, scratch)
+    require_metric(spool.first)
+    if job.grid is not None:
+        progress.stage(f"{spool.first.name}: octree voxel grid on tiles")
+    first = spool.first
+    told = {
+        "name": first.name,
+        "notes": list(first.notes),
+        "origin": first.frame.origin.tolist(),
+    }
+    return partition(spool, job.grid, scratch, most, max(most // _HALO_SHARE, 1), told)
+
+
+def _grid_stage(tiles: TiledCloud, seconds: float) -> StageCount:
+    return StageCount(
+        name="octree_voxel_grid",
+        points_in=tiles.facts["points_in"],
+        points_out=tiles.points,
+        seconds=seconds,
     )
+
+
+def _books(
+    bench: TileBench, stages: tuple[StageCount, ...], notes: tuple[str, ...], noticed: Sequence[str]
+) -> Books:
+    """Return what the stages decided about every point of the whole cloud, in its order."""
+    points = bench.cloud.facts["points_in"]
+    codes = np.full(points, Reason.DECIMATED, dtype=np.uint8)
+    ground = np.zeros(points, dtype=np.uint8)
+    details: dict[str, NDArray[Any]] = {}
+    folder = bench.cloud.folder
+    for tile in bench.cloud.tiles:
+        row = read_arrays(folder, tile, POINTS, "row")["row"]
+        state = state_of(folder, tile, bench.state)
+        codes[row], ground[row] = state["code"], state["ground"]
+        for name in (DETAIL, MARGIN):
+            if name in state:
+                details.setdefault(name, np.zeros(points, state[name].dtype))[row] = state[name]
+    return Books(
+        codes=codes,
+        ground_class=ground,
+        stages=stages,
+        notes=notes,
+        noticed=tuple(noticed),
+        details=details,
+    )
+
+
+def forget_tiles(folder: Path) -> None:
+    """Delete the tiles in `folder`."""
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def undecimated(
@@ -188,47 +276,3 @@ def left_of(
     """Return `details` (n,) of the points that the voxel grid left, by all codes (n,)."""
     is_left = codes != Reason.DECIMATED
     return {name: values[is_left] for name, values in details.items()}
-
-
-def _decimated(
-    chunks: Iterator[Cloud],
-    grid: OctreeVoxelGrid,
-    tile_points: int,
-    scratch: Path,
-    progress: Progress,
-) -> tuple[Decimated, float]:
-    scratch.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix="tiles-", dir=scratch) as folder:
-        spool = Spool(chunks, Path(folder))
-        require_metric(spool.first)
-        progress.stage(f"{spool.first.name}: octree voxel grid on tiles")
-        start = time.perf_counter()
-        decimated = decimate(spool, grid, tile_points)
-    return decimated, time.perf_counter() - start
-
-
-def _finished(
-    decimated: Decimated, seconds: float, after: Callable[[Bench], None], progress: Progress
-) -> Filtered:
-    """Run the filters behind the grid, and book them on the whole cloud."""
-    bench = Bench(decimated.cloud, progress)
-    bench.voxel_count = decimated.voxel_count
-    bench.stages.append(
-        StageCount(
-            name="octree_voxel_grid",
-            points_in=decimated.points_in,
-            points_out=len(decimated.cloud),
-            seconds=seconds,
-        )
-    )
-    after(bench)
-    left = bench.result()
-    codes = np.full(decimated.points_in, Reason.DECIMATED, dtype=np.uint8)
-    codes[decimated.row] = left.codes
-    ground_class = np.zeros(decimated.points_in, dtype=np.uint8)
-    ground_class[decimated.row] = left.ground_class
-    details = {}
-    for name, values in left.details.items():
-        details[name] = np.zeros(decimated.points_in, dtype=values.dtype)
-        details[name][decimated.row] = values
-    return replace(left, codes=codes, ground_class=ground_class, details=details)

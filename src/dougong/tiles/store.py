@@ -7,7 +7,7 @@ being open, and a file is read back in the pieces it was written in.
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -118,7 +118,11 @@ def _told(path: Path) -> Iterator[None]:
         raise OutputError(msg) from error
 
 
-def make_row_file(folder: Path) -> Callable[[str, np.dtype[Any]], RowFile]:
+RowFileMaker: TypeAlias = Callable[[str, np.dtype[Any]], RowFile]
+"""Makes a new file of rows by its name and the layout of their records."""
+
+
+def make_row_file(folder: Path) -> RowFileMaker:
     """Return a maker of new row files in `folder`, which is made where it is missing."""
     with _told(folder / "tiles"):
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,67 @@
+"""A cloud on disk in the order it was decoded, and its cutting into tiles."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from dougong.cloud import Cloud
+from dougong.tiles.grid import TileGrid, part
+from dougong.tiles.store import RowFile, RowFileMaker, Rows, make_row_file
+from dougong.typing import Points
+
+
+class Spool:
+    """A cloud on disk in the order it was decoded."""
+
+    def __init__(self, clouds: Iterable[Cloud], folder: Path) -> None:
+        """Write `clouds`, which share one frame and one layout, to `folder`."""
+        self._make = make_row_file(folder)
+        self.points = 0
+        self._file: RowFile | None = None
+        for cloud in clouds:
+            if self._file is None:
+                self.first = cloud.select(np.arange(0))
+                self._file = self._make("spool", cloud.records.dtype)
+            rows = np.arange(self.points, self.points + len(cloud))
+            self._file.append(Rows(rows, cloud.xyz, cloud.records))
+            self.points += len(cloud)
+
+    def pieces(self) -> Iterator[Rows]:
+        """Yield the cloud from its beginning."""
+        assert self._file is not None
+        return self._file.pieces()
+
+    def blocks(self) -> Iterator[Points]:
+        """Yield the coordinates from the beginning."""
+        return (rows.xyz for rows in self.pieces())
+
+    def cut(self, grid: TileGrid, most: int) -> Iterator[RowFile]:
+        """Cut the cloud into tiles, see `cut`. The spool is used up."""
+        assert self._file is not None
+        yield from cut(self._file, grid, most, self._make)
+
+
+def cut(file: RowFile, grid: TileGrid, most: int, make: RowFileMaker) -> Iterator[RowFile]:
+    """Cut the rows of `file` into tiles of at most `most` points and yield them one by one.
+
+    The file is used up. Tiles are yielded in the order of their coordinates; whoever takes one
+    removes it. A tile of one voxel is never halved, however many points lie in it.
+    """
+    tiles: dict[tuple[int, ...], RowFile] = {}
+    counts: dict[tuple[int, ...], int] = {}
+    for rows in file.pieces():
+        parts = part(rows.xyz, grid)
+        for index, key in enumerate(map(tuple, parts.tiles.tolist())):
+            chosen = parts.order[parts.starts[index] : parts.starts[index + 1]]
+            if key not in tiles:
+                name = "_".join(map(str, (grid.level, *key)))
+                tiles[key] = make(name, file.layout)
+            tiles[key].append(rows.take(chosen))
+            counts[key] = counts.get(key, 0) + len(chosen)
+    file.remove()
+    for key in sorted(tiles):
+        if counts[key] > most and grid.level > 0:
+            yield from cut(tiles[key], grid.children(), most, make)
+        else:
+            yield tiles[key]

@@ -1,0 +1,274 @@
+"""A recipe on a tiled cloud, stage by stage: map over the tiles, a small reduce, map again.
+
+What a stage leaves is known by the hash of everything before it and of its parameters, so a run
+goes on where it was and a changed parameter reruns only what depends on it.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import dougong
+from dougong.filters import protective
+from dougong.filters.cloth_simulation import ClothSimulation, cloth_notes, guarded_cloth
+from dougong.filters.concentration import note_of, tally
+from dougong.filters.curvature_weighted import CurvatureWeighted
+from dougong.filters.low_outliers import LowOutliers, find_levels, low_notes
+from dougong.filters.pass_through import PassThrough, robust_top_of, unknown_notes
+from dougong.filters.radius import Radius
+from dougong.filters.ranks import ValueBlocks, median
+from dougong.filters.selection import Reason
+from dougong.filters.statistical import Statistical, cut_distance, stray_notes
+from dougong.filters.totals import Totals
+from dougong.params import Parameters
+from dougong.tiles import work
+from dougong.tiles.cloud import (
+    Arrays,
+    Record,
+    TiledCloud,
+    path_of,
+    read_arrays,
+    read_record,
+    write_arrays,
+)
+from dougong.tiles.engine import Engine, Task
+from dougong.tiles.work import Among, Job, asked_points, is_asked, state_of
+
+Work = Callable[[Job], tuple[Arrays, Record]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageDone:
+    """What one filter did to all tiles."""
+
+    name: str
+    left: int
+    """Points that there were."""
+    asked: int
+    """Of these, those that it judged."""
+    taken: int
+    notes: tuple[str, ...]
+    seconds: float
+
+
+@dataclass(slots=True)
+class TileBench:
+    """The tiles, and the key of the state that they are in."""
+
+    cloud: TiledCloud
+    engine: Engine
+    state: str = ""
+    done: list[StageDone] = field(default_factory=list)
+
+    def apply(self, name: str, params: Parameters, among: Among = "left") -> StageDone:
+        """Run one filter on the points left.
+
+        Raises
+        ------
+        TileError, OutputError
+            Some tiles failed, or the disk is full.
+        """
+        start = time.perf_counter()
+        stage = _Stage(self.cloud, self.engine, self.state, params, among)
+        records, notes, self.state = _RUN[name](stage)
+        totals = {key: sum(r[key] for r in records) for key in ("left", "asked", "taken")}
+        found = StageDone(name=name, notes=notes, seconds=time.perf_counter() - start, **totals)
+        self.done.append(found)
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Stage:
+    """One filter on its way: the tiles as they were before it."""
+
+    cloud: TiledCloud
+    engine: Engine
+    before: str
+    params: Parameters
+    among: Among
+
+    def key(self, name: str, known: Any = None) -> str:
+        """Return the name of a step of this stage: a hash of all that its result depends on."""
+        told = self.params.model_dump(mode="json")
+        facts = [dougong.__version__, self.before, name, told, self.among, known]
+        return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
+
+    def map(self, name: str, do: Work, known: Any = None) -> tuple[list[Record], str]:
+        """Run `do` on every tile; return the records and the key of the step."""
+        key = self.key(name, str(known) if isinstance(known, Path) else repr(known))
+        job = partial(
+            Job,
+            before=self.before,
+            params=self.params,
+            among=self.among,
+            asked=self.asked(),
+            known=known,
+        )
+        folder = self.cloud.folder
+        tasks = [
+            Task(tile.name, path_of(folder, tile, key), do, job(folder, tile))
+            for tile in self.cloud.tiles
+        ]
+        return self.engine.run(tasks), key
+
+    def mask_and_state(self, tile: Any) -> tuple[Any, Arrays]:
+        """Return which points of a tile are asked about, and their state."""
+        state = state_of(self.cloud.folder, tile, self.before)
+        return is_asked(state, self.among), state
+
+    def asked(self) -> int:
+        """Return how many points the stage is asked about."""
+        return sum(int(self.mask_and_state(tile)[0].sum()) for tile in self.cloud.tiles)
+
+    def blocks(self) -> Any:
+        """Yield the points that the stage is asked about, tile by tile."""
+        for tile in self.cloud.tiles:
+            job = Job(self.cloud.folder, tile, self.before, self.params, self.among)
+            yield asked_points(job, tile)
+
+    def values(self, stage: str, name: str) -> ValueBlocks:
+        """Return the blocks of an array of an earlier step."""
+        folder, tiles = self.cloud.folder, self.cloud.tiles
+        return lambda: (read_arrays(folder, tile, stage, name)[name] for tile in tiles)
+
+    def kept(self, name: str, make: Callable[[int], tuple[Arrays, Record]]) -> tuple[Path, Record]:
+        """Return the file, and the record, of what `make` finds of the whole cloud."""
+        path = self.cloud.folder / f"whole.{self.key(name)}.npz"
+        record = read_record(path)
+        if record is None:
+            arrays, record = make(self.asked())
+            write_arrays(path, arrays, record)
+        return path, record
+
+
+Outcome = tuple[list[Record], tuple[str, ...], str]
+
+
+def _sum(records: list[Record], name: str) -> int:
+    return sum(record[name] for record in records)
+
+
+def _low_outliers(stage: _Stage) -> Outcome:
+    assert isinstance(stage.params, LowOutliers)
+    params = stage.params
+
+    def make(asked: int) -> tuple[Arrays, Record]:
+        return _packed(find_levels(stage.blocks, asked, params)._asdict()), {}
+
+    path, _ = stage.kept("levels", make)
+    records, key = stage.map("low_outliers", work.judge_low, path)
+    return records, low_notes(_sum(records, "taken"), _sum(records, "asked")), key
+
+
+def _cloth(stage: _Stage) -> Outcome:
+    assert isinstance(stage.params, ClothSimulation)
+    params = stage.params
+
+    def make(asked: int) -> tuple[Arrays, Record]:
+        cloth, low = guarded_cloth(stage.blocks, asked, params)
+        return _packed({name: getattr(cloth, name) for name in cloth.__slots__}), {"low": low}
+
+    path, record = stage.kept("cloth", make)
+    records, key = stage.map("cloth_simulation", work.judge_cloth, path)
+    notes = cloth_notes(record["low"], _sum(records, "lost"), _sum(records, "asked"))
+    return records, notes, key
+
+
+def _packed(fields: dict[str, Any]) -> Arrays:
+    return {name: np.asarray(value) for name, value in fields.items()}
+
+
+def _radius(stage: _Stage) -> Outcome:
+    assert isinstance(stage.params, Radius)
+    records, key = stage.map("radius", work.judge_radius)
+    return records, (), key
+
+
+def _statistical(stage: _Stage) -> Outcome:
+    assert isinstance(stage.params, Statistical)
+    if stage.params.radius_m is not None:
+        _, means = stage.map("mean_within", work.mean_within)
+    else:
+        _, means = stage.map("nearest", work.nearest, stage.params.neighbours)
+    cut, strays = cut_distance(stage.values(means, "mean"), stage.params.multiplier)
+    records, key = stage.map("statistical", work.judge_statistical, (means, cut))
+    return records, stray_notes(strays), key
+
+
+def _pass_through(stage: _Stage) -> Outcome:
+    assert isinstance(stage.params, PassThrough)
+    top = None
+    if stage.params.margin_above_top_m is not None:
+        top = robust_top_of(lambda: _heights(stage))
+    records, key = stage.map("pass_through", work.judge_pass_through, top)
+    return records, unknown_notes(_sum(records, "unknown")), key
+
+
+def _heights(stage: _Stage) -> Any:
+    for tile in stage.cloud.tiles:
+        mask, state = stage.mask_and_state(tile)
+        yield state["height"][mask] if "height" in state else np.empty(0)
+
+
+def _curvature_weighted(stage: _Stage) -> Outcome:
+    assert isinstance(stage.params, CurvatureWeighted)
+    if stage.params.rule == "protective":
+        return _protective(stage, stage.params)
+    known = None
+    if stage.params.rule == "global":
+        counted, _ = stage.map("totals", work.count_curvature)
+        totals = sum((Totals(*record["totals"]) for record in counted), Totals())
+        known = (totals.count, totals.total, totals.squares)
+    records, key = stage.map("curvature_weighted", work.judge_curvature, known)
+    return records, (), key
+
+
+def _protective(stage: _Stage, params: CurvatureWeighted) -> Outcome:
+    asked = stage.asked()
+    reach = params.reach_m
+    if reach is None:
+        _, found = stage.map("eighth", work.nearest, protective.TESTS)
+        reach = protective.reach_of(stage.values(found, "largest"), asked)
+    is_whole = params.reach_m is None
+    whole = protective.Whole(reach, is_few=is_whole and asked <= protective.TESTS)
+    records, key = stage.map("curvature_weighted", work.judge_protective, whole)
+    if is_whole and asked and not any(record["has_large"] for record in records):
+        # A small thing alone is what was scanned: its largest group counts as large.
+        whole = whole._replace(many=max(record["most"] for record in records))
+        records, key = stage.map("curvature_weighted", work.judge_protective, whole)
+    note = _concentration(stage, key) if asked else None
+    return records, () if note is None else (note,), key
+
+
+def _concentration(stage: _Stage, key: str) -> str | None:
+    """Return what is to be said where removal concentrates on fine geometry."""
+    spacing_m = median(stage.values(key, "spacing"))
+    if not spacing_m > 0:
+        return None
+    found = None
+    for tile, points in zip(stage.cloud.tiles, stage.blocks(), strict=True):
+        if not len(points):
+            continue
+        mask, _ = stage.mask_and_state(tile)
+        after = read_arrays(stage.cloud.folder, tile, key, "code", "curvature")
+        is_kept = after["code"][mask] == Reason.KEPT
+        part = tally(points, is_kept, after["curvature"], spacing_m)
+        found = part if found is None else found.merged(part)
+    return None if found is None else note_of(found)
+
+
+_RUN: dict[str, Callable[[_Stage], Outcome]] = {
+    "low_outliers": _low_outliers,
+    "cloth_simulation": _cloth,
+    "curvature_weighted": _curvature_weighted,
+    "statistical": _statistical,
+    "radius": _radius,
+    "pass_through": _pass_through,
+}

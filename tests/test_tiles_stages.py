@@ -1,0 +1,165 @@
+"""Every filter on tiles keeps what it keeps on the whole cloud, to the bit."""
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from dougong.cloud import Cloud
+from dougong.errors import TileError
+from dougong.filters import FILTERS
+from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
+from dougong.filters.selection import Reason, details_of
+from dougong.tiles.cloud import load_tiles, read_arrays
+from dougong.tiles.engine import local_engine
+from dougong.tiles.partition import partition
+from dougong.tiles.spool import Spool
+from dougong.tiles.stages import TileBench
+
+JOBS = [
+    ("low_outliers", {}),
+    ("cloth_simulation", {}),
+    ("radius", {"radius_m": 0.3}),
+    ("statistical", {}),
+    ("statistical", {"radius_m": 0.4}),
+    ("curvature_weighted", {"reach_m": 0.5}),
+    ("curvature_weighted", {}),
+    ("curvature_weighted", {"rule": "paper"}),
+    ("curvature_weighted", {"rule": "global"}),
+    ("pass_through", {"x_m": (-5.0, 9.0)}),
+]
+
+
+def site(seed, count=3000):
+    """Ground, a wall, a box, noise round them, a pair and a clump far off, points far away."""
+    rng = np.random.default_rng(seed)
+    ground = np.column_stack([rng.uniform(-12, 12, (count, 2)), 0.01 * rng.normal(size=count)])
+    wall = np.column_stack(
+        [rng.uniform(-9, 9, count), 0.01 * rng.normal(size=count), 4 * rng.random(count)]
+    )
+    noise = rng.uniform([-12, -12, -4], [12, 12, 9], (150, 3))
+    clump = rng.normal([0, 11, 6], 0.1, (30, 3))
+    far = rng.uniform(300, 900, (3, 3))
+    points = np.vstack([ground, wall, noise, clump, far, wall[:20]])
+    return np.round(points[rng.permutation(len(points))], 3)
+
+
+def tiled(points, folder, most, grid=None, chunk=1111):
+    whole = Cloud.from_points(points)
+    pieces = (
+        whole.select(np.arange(a, min(a + chunk, len(points))))
+        for a in range(0, len(points), chunk)
+    )
+    return partition(Spool(pieces, folder), grid, folder, most, most), whole
+
+
+def states(bench, points):
+    """Return an array of the state over all points, by its name."""
+    found = {}
+    for tile in bench.cloud.tiles:
+        row = read_arrays(bench.cloud.folder, tile, "points", "row")["row"]
+        for name, values in read_arrays(bench.cloud.folder, tile, bench.state).items():
+            if len(values) == len(row):
+                found.setdefault(name, np.zeros(points, values.dtype))[row] = values
+    return found
+
+
+@pytest.mark.parametrize(("name", "values"), JOBS)
+@pytest.mark.parametrize("most", [700, 10**9])
+def test_tiles_judge_as_the_whole(tmp_path, name, values, most):
+    spec = FILTERS[name]
+    cloud, whole = tiled(site(0), tmp_path, most)
+    assert (len(cloud.tiles) > 8) == (most < 1000)
+    params = spec.params(**values)
+    expected = spec.verb(whole.xyz, params)
+    with local_engine() as engine:
+        bench = TileBench(cloud, engine)
+        done = bench.apply(name, params)
+    found = states(bench, len(whole.xyz))
+    np.testing.assert_array_equal(found["code"] == Reason.KEPT, expected.is_kept)
+    assert done.notes == expected.notes
+    assert (done.asked, done.taken) == (len(whole.xyz), int((~expected.is_kept).sum()))
+    for detail, wanted in details_of(expected).items():
+        np.testing.assert_array_equal(found[detail], wanted)
+    if name == "cloth_simulation":
+        np.testing.assert_array_equal(found["ground"], expected.attributes["ground_class"])
+        np.testing.assert_array_equal(found["height"], expected.attributes["height_above_ground"])
+
+
+RECIPE = [
+    ("low_outliers", {}, "left"),
+    ("cloth_simulation", {"class_threshold_m": 0.1}, "left"),
+    ("curvature_weighted", {}, "off_ground"),
+    ("pass_through", {"margin_above_top_m": 0.4, "margin_below_ground_m": 1.0}, "left"),
+]
+
+
+def kept_places(points, folder, most, steps=RECIPE):
+    """Return the kept points, sorted, after a voxel grid and a whole recipe."""
+    cloud, whole = tiled(points, folder, most, OctreeVoxelGrid(voxel_m=0.1))
+    with local_engine() as engine:
+        bench = TileBench(cloud, engine)
+        for name, values, among in steps:
+            bench.apply(name, FILTERS[name].params(**values), among)
+    is_kept = states(bench, len(points))["code"] == Reason.KEPT
+    rows = np.concatenate([read_arrays(folder, t, "points", "row")["row"] for t in cloud.tiles])
+    chosen = np.zeros(len(points), bool)
+    chosen[rows] = True
+    kept = whole.xyz[is_kept & chosen] + whole.frame.origin
+    return np.round(kept[np.lexsort(kept.T)], 3), [done.taken for done in bench.done]
+
+
+@settings(max_examples=2, deadline=None, phases=[Phase.generate])
+@given(st.integers(0, 2**32 - 1), st.integers(200, 2500))
+def test_a_recipe_is_the_same_on_any_tiles_in_any_order(tmp_path_factory, seed, most):
+    points = site(seed, 1500)
+    order = np.random.default_rng(seed).permutation(len(points))
+    whole, taken = kept_places(points, tmp_path_factory.mktemp("whole"), 10**9)
+    again, same = kept_places(points[order], tmp_path_factory.mktemp("tiles"), most)
+    assert taken == same
+    np.testing.assert_array_equal(again, whole)
+
+
+def test_finished_tiles_are_not_done_again(tmp_path, monkeypatch):
+    from dougong.tiles import engine as engines
+
+    kept_places(site(1), tmp_path, 1500)
+    cloud = load_tiles(tmp_path)
+    done, perform = [], engines.perform
+    monkeypatch.setattr(engines, "perform", lambda task: done.append(task.work) or perform(task))
+
+    def again(steps):
+        done.clear()
+        with local_engine() as engine:
+            bench = TileBench(cloud, engine)
+            for name, values, among in steps:
+                bench.apply(name, FILTERS[name].params(**values), among)
+        return {work.__name__ for work in done}
+
+    assert again(RECIPE) == set()
+    changed = [*RECIPE[:3], ("pass_through", {"z_m": (0.0, 3.0)}, "left")]
+    assert again(changed) == {"judge_pass_through"}
+
+
+def test_a_failing_tile_is_tried_again_then_named_and_the_rest_completes(tmp_path, monkeypatch):
+    cloud, _ = tiled(site(2), tmp_path, 1500)
+    from dougong.filters.radius import Radius
+    from dougong.tiles import work
+
+    bad, tries, judge = cloud.tiles[1].name, [], work.judge_radius
+
+    def failing(job):
+        if job.tile.name == bad:
+            tries.append(job)
+            raise MemoryError("no room")
+        return judge(job)
+
+    monkeypatch.setattr(work, "judge_radius", failing)
+    with local_engine() as engine, pytest.raises(TileError, match=rf"1 of .*{bad}.*no room"):
+        TileBench(cloud, engine).apply("radius", Radius())
+    assert len(tries) == 2
+    monkeypatch.setattr(work, "judge_radius", judge)
+    finished = len(list(tmp_path.glob("*.npz"))) - len(cloud.tiles)
+    assert finished == len(cloud.tiles) - 1
+    with local_engine() as engine:
+        assert TileBench(cloud, engine).apply("radius", Radius()).asked == cloud.points
