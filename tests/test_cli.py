@@ -85,7 +85,7 @@ def test_every_command_helps_with_an_example(command, capsys):
         (["demo", "--scene", "castle"], '"hall", "pagoda"'),
         (["run", "--lidar", "a.laz"], "--out"),
         (["info"], "no file is named"),
-        (["info", "a.laz", "--engine", "dask"], "--engine dask is not part of this version"),
+        (["info", "a.laz", "--engine", "spark"], "--engine knows local, dask and dask://HOST:PORT"),
         (["info", "a.laz", "--memory", "lots"], "--memory needs a size"),
         (["info", "a.laz", "--threads", "0"], "--threads must be 1 or more"),
         (["register", "a", "b", "--out", "c", "--dof", "8"], "--dof"),

@@ -11,7 +11,9 @@ from dougong.errors import OutputError
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid, robust_box
 from dougong.formats import faults_of, read, write
 from dougong.pipeline import memory
+from dougong.threads import set_threads
 from dougong.tiles.cloud import read_arrays
+from dougong.tiles.engine import set_engine
 from dougong.tiles.grid import TileGrid, grid_for, part
 from dougong.tiles.partition import partition
 from dougong.tiles.spool import Spool
@@ -186,3 +188,16 @@ def test_a_grid_that_leaves_too_much_is_refused(scan, tmp_path, little_room, cap
     assert call([*tokens, "--memory", "190kB"]) == 2
     assert "points are left after the voxel grid" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.filterwarnings("ignore")  # of the cluster's own
+def test_a_dask_cluster_gives_the_same(scan, tmp_path, little_room):
+    pytest.importorskip("distributed")
+    whole, _ = filtered_by(scan, tmp_path / "whole.laz", "--kind", "lidar", "--memory", "4GB")
+    options = ("--kind", "lidar", "--memory", "190kB", "--engine", "dask", "--threads", "2")
+    try:
+        tiled, _ = filtered_by(scan, tmp_path / "tiled.laz", *options)
+    finally:
+        set_engine("local")
+        set_threads(2)
+    np.testing.assert_array_equal(tiled.records, whole.records)

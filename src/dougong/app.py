@@ -6,6 +6,7 @@ dougong`` stay quick.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -122,6 +123,15 @@ def init(folder: Path, *, overwrite: bool, progress: Progress) -> Document:
     write_text(path, project_text(folder.resolve().name, guesses, skipped))
     clouds = [{**asdict(guess), "file": str(guess.file)} for guess in guesses]
     return {"project": str(path), "clouds": clouds, "skipped": skipped}
+
+
+def use_engine(name: str) -> None:
+    """Use an engine for tiles from now on; see `dougong.tiles.engine.set_engine`."""
+    # The local one is there from the start: nothing is loaded for it.
+    if name != "local" or "dougong.tiles.engine" in sys.modules:
+        from dougong.tiles.engine import set_engine
+
+        set_engine(name)
 
 
 def filter_file(

@@ -29,7 +29,8 @@ class Common:
     """Memory to stay under, for example 4GB: larger scans are decimated on tiles, what still does
     not fit is refused."""
     engine: Annotated[str, Parameter(group=GLOBAL)] = "local"
-    """Who runs the work. This version knows: local."""
+    """Who works on the tiles of clouds larger than memory: local, dask (processes of this machine)
+    or dask://HOST:PORT."""
     work: Annotated[Path | None, Parameter(group=GLOBAL)] = None
     """Folder for finished steps, so that a cancelled run goes on; default: beside the output."""
     seed: Annotated[int, Parameter(group=GLOBAL)] = 0
@@ -67,14 +68,8 @@ class Common:
         Raises
         ------
         InputError
-            An unknown engine, or a thread count below one.
+            A thread count below one.
         """
-        if self.engine != "local":
-            msg = (
-                f"--engine {self.engine} is not part of this version, which runs on this "
-                "machine only. Leave the option out or pass --engine local."
-            )
-            raise InputError(msg)
         if self.threads is not None and self.threads < 1:
             msg = f"--threads must be 1 or more, got {self.threads}."
             raise InputError(msg)

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from dougong import errors
+from dougong import app, errors
 from dougong.cli._common import Common
 from dougong.cli._progress import Bars, Lines, Quiet, listener
 from dougong.threads import set_threads
@@ -55,6 +55,7 @@ def execute(common: Common, work: Callable[[Listener], Answer], kept: str = "") 
         common.check()
         if common.threads is not None:
             set_threads(common.threads)
+        app.use_engine(common.engine)
         progress = listener(common.quiet)
         answer = _cancellable(work, progress)
     except KeyboardInterrupt:

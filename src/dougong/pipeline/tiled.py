@@ -28,7 +28,7 @@ from dougong.pipeline.progress import Progress
 from dougong.pipeline.steps import StageCount, Step, doubts, nothing_kept
 from dougong.pipeline.store import Books
 from dougong.tiles.cloud import POINTS, TiledCloud, load_tiles, read_arrays
-from dougong.tiles.engine import local_engine
+from dougong.tiles.engine import engine_in_use
 from dougong.tiles.partition import partition
 from dougong.tiles.spool import Spool
 from dougong.tiles.stages import TileBench
@@ -147,42 +147,56 @@ def filter_chunks(
     FormatError, OutputError, TileError
         The file cannot be read, `scratch` cannot be written (a full disk), a tile failed.
     """
-    most = room.tile_points(points, waiting)
     start = time.perf_counter()
-    tiles = load_tiles(scratch)
-    if tiles is None:
-        tiles = _cut(chunks, job, most, scratch, progress)
-    name = tiles.facts["name"]
-    if is_kept_in_memory:
-        room.refuse_kept(tiles.points, waiting, name)
-    stages = [_grid_stage(tiles, time.perf_counter() - start)] if job.grid is not None else []
-    notes: list[str] = []
-    with local_engine() as engine:
+    with engine_in_use() as engine:
+        tiles = load_tiles(scratch)
+        if tiles is None:
+            most = room.tile_points(points, waiting)
+            kept = max(most // (_HALO_SHARE * engine.width), 1)
+            tiles = _cut(chunks, job, most, kept, scratch, progress)
+        name = tiles.facts["name"]
+        if is_kept_in_memory:
+            room.refuse_kept(tiles.points, waiting, name)
+        stages = [_grid_stage(tiles, time.perf_counter() - start)] if job.grid is not None else []
         bench = TileBench(tiles, engine)
-        for step in job.steps:
-            progress.stage(f"{name}: {step.name.replace('_', ' ')} on tiles")
-            params = step.params
-            if isinstance(params, PassThrough):
-                params = params.shifted(tiles.facts["origin"])
-            done = bench.apply(step.name, params, step.among)
-            said = [*done.notes, *doubts(FILTERS[step.name].reason, done.taken, done.asked)]
-            notes += [f"{name}, {step.name}: {note}" for note in said]
-            stages.append(
-                StageCount(
-                    name=step.name,
-                    points_in=done.left,
-                    points_out=done.left - done.taken,
-                    seconds=done.seconds,
-                )
-            )
+        notes = _run_steps(bench, job, stages, progress)
     if stages and not stages[-1].points_out:
         raise InputError(nothing_kept(name, tiles.facts["points_in"], stages))
     noticed = (*tiles.facts["notes"], *tiles.facts["faults"])
     return _books(bench, tuple(stages), tuple(notes), noticed)
 
 
+def _run_steps(
+    bench: TileBench, job: TiledJob, stages: list[StageCount], progress: Progress
+) -> list[str]:
+    """Run the filters behind the grid; add to `stages`, and return what was said."""
+    name, notes = bench.cloud.facts["name"], []
+    for step in job.steps:
+        progress.stage(f"{name}: {step.name.replace('_', ' ')} on tiles")
+        params = step.params
+        if isinstance(params, PassThrough):
+            params = params.shifted(bench.cloud.facts["origin"])
+        done = bench.apply(step.name, params, step.among)
+        said = [*done.notes, *doubts(FILTERS[step.name].reason, done.taken, done.asked)]
+        notes += [f"{name}, {step.name}: {note}" for note in said]
+        stages.append(
+            StageCount(
+                name=step.name,
+                points_in=done.left,
+                points_out=done.left - done.taken,
+                seconds=done.seconds,
+            )
+        )
+    return notes
+
+
 def _cut(
-    chunks: Iterator[Cloud], job: TiledJob, most: int, scratch: Path, progress: Progress
+    chunks: Iterator[Cloud],
+    job: TiledJob,
+    most: int,
+    most_kept: int,
+    scratch: Path,
+    progress: Progress,
 ) -> TiledCloud:
     """Write the cloud to `scratch`, thin it where the job begins with a grid, and cut it."""
     # What a killed run left is of no use before its last file, the list of tiles.
@@ -197,7 +211,7 @@ def _cut(
         "notes": list(first.notes),
         "origin": first.frame.origin.tolist(),
     }
-    return partition(spool, job.grid, scratch, most, max(most // _HALO_SHARE, 1), told)
+    return partition(spool, job.grid, scratch, most, most_kept, told)
 
 
 def _grid_stage(tiles: TiledCloud, seconds: float) -> StageCount:

@@ -4,14 +4,17 @@ A task writes one file and returns a small record. A task whose file is there is
 run again; one that fails is tried once more, then named, and the others go on.
 """
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from dougong.errors import DougongError, OutputError, TileError
+from dougong.errors import DougongError, InputError, OutputError, TileError
+from dougong.threads import get_threads, set_threads
 from dougong.tiles.cloud import Arrays, Record, read_record, write_arrays
 
 _TRIES = 2
@@ -93,6 +96,55 @@ def _told(failed: dict[int, BaseException], tasks: Sequence[Task]) -> DougongErr
     )
     error.__cause__ = first
     return error
+
+
+_name = "local"
+
+
+def set_engine(name: str) -> None:
+    """Use an engine from now on (``--engine``): local, dask or dask://HOST:PORT.
+
+    Raises
+    ------
+    InputError
+        There is no such engine, or Dask is not installed.
+    """
+    global _name
+    if name != "local" and name != "dask" and not re.fullmatch(r"dask://[^/\s]+:\d+", name):
+        msg = f"--engine knows local, dask and dask://HOST:PORT, got {name!r}. Choose one of these."
+        raise InputError(msg)
+    if name != "local" and find_spec("distributed") is None:
+        msg = f"--engine {name} needs Dask, which is not here: pip install 'dougong[dask]'."
+        raise InputError(msg)
+    _name = name
+
+
+@contextmanager
+def engine_in_use() -> Iterator[Engine]:
+    """Yield the engine that was asked for."""
+    with local_engine() if _name == "local" else _dask_engine(_name) as engine:
+        yield engine
+
+
+@contextmanager
+def _dask_engine(name: str) -> Iterator[Engine]:
+    """Yield a Dask cluster: the one named, or processes of this machine, one per thread.
+
+    Workers of a cluster elsewhere must see the folder of ``--work`` under the same path.
+    """
+    from distributed import Client, LocalCluster
+
+    with ExitStack() as stack:
+        if name == "dask":
+            cluster = LocalCluster(
+                n_workers=get_threads(), threads_per_worker=1, dashboard_address=None
+            )
+            client = stack.enter_context(Client(stack.enter_context(cluster)))
+        else:
+            client = stack.enter_context(Client(name.replace("dask://", "tcp://"), timeout="10s"))
+        # A worker has one thread of its own; several tiles are its parallelism.
+        client.run(set_threads, 1)
+        yield Engine(client.get_executor(), max(1, sum(client.nthreads().values())))
 
 
 @contextmanager
