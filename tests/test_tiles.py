@@ -1,6 +1,8 @@
 """Tiled work gives the points that whole work gives, whatever the tiles."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -201,3 +203,36 @@ def test_a_dask_cluster_gives_the_same(scan, tmp_path, little_room):
         set_engine("local")
         set_threads(2)
     np.testing.assert_array_equal(tiled.records, whole.records)
+
+
+KILLED = """
+import os, sys
+from dougong.cli import call
+from dougong.pipeline import memory
+from dougong.tiles import engine
+
+memory.BASE_BYTES, memory.BYTES_PER_POINT, memory._LEAST_TILE_POINTS = 0, 5, 100
+memory._BYTES_PER_BOOKED_POINT, memory._BYTES_PER_TILE_POINT = 2, 12
+left, perform = int(sys.argv[1]), engine.perform
+
+def counted(task):
+    global left
+    left -= 1
+    if left < 0:
+        os.kill(os.getpid(), 9)
+    return perform(task)
+
+engine.perform = counted
+sys.exit(call(sys.argv[2:]))
+"""
+
+
+def test_a_killed_run_goes_on_where_it_was(scan, tmp_path, little_room):
+    whole, _ = filtered_by(scan, tmp_path / "whole.laz", "--kind", "lidar", "--memory", "4GB")
+    tokens = ["filter", str(scan), str(tmp_path / "out.laz"), "--kind", "lidar", "--set", VOXEL]
+    tokens += ["--memory", "190kB", "--work", str(tmp_path / "work"), "--quiet"]
+    # At last no task is allowed: none is done again.
+    for tasks, code in ((7, -9), (9, -9), (1000, 0), (0, 0)):
+        command = [sys.executable, "-c", KILLED, str(tasks), *tokens, "--overwrite"]
+        assert subprocess.run(command, check=False).returncode == code
+    np.testing.assert_array_equal(read(tmp_path / "out.laz").records, whole.records)

@@ -143,6 +143,7 @@ def filter_file(
     mark: bool,
     settings: Sequence[str],
     overwrite: bool,
+    work: Path | None = None,
     memory_bytes: int | None,
     progress: Progress,
 ) -> Document:
@@ -158,6 +159,7 @@ def filter_file(
         overwrite=overwrite,
         memory_bytes=memory_bytes,
         progress=progress,
+        work=work,
     )
 
 

@@ -59,6 +59,7 @@ def command(
             mark=mark,
             settings=settings or (),
             overwrite=overwrite,
+            work=common.work,
             memory_bytes=common.memory_bytes(),
             progress=progress,
         )

@@ -1,5 +1,6 @@
 """``dougong filter``: one file through a recipe or one filter, with its books beside it."""
 
+import hashlib
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -7,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import dougong
 from dougong.cloud import Cloud, Pieces
 from dougong.errors import InputError
 from dougong.filters.selection import Reason
@@ -120,8 +122,11 @@ def filter_file(
     overwrite: bool,
     memory_bytes: int | None,
     progress: Progress,
+    work: Path | None = None,
 ) -> Document:
     """Filter one file into another and write its books beside it (``OUTPUT.json``).
+
+    `work` keeps the tiles of a cloud larger than memory: a run that was stopped goes on there.
 
     Raises
     ------
@@ -137,7 +142,7 @@ def filter_file(
     with clock.measure("read"):
         digest = sha256(input)
     room = Room.of(memory_bytes)
-    with _scratch(output) as scratch:
+    with _scratch(output, work, f"{digest} {job.tiled().grid!r} in {room.bytes:.0f}") as scratch:
         result: Cloud | Pieces
         hold: Hold | None = None
         filtered: Filtered | Books
@@ -145,7 +150,6 @@ def filter_file(
             progress.note(f"{input.name} is larger than memory: it is filtered on tiles")
             with clock.measure("filter"):
                 filtered = _filtered_on_tiles(input, job, room, scratch, progress)
-            forget_tiles(scratch)
             noticed = filtered.noticed
             hold = Hold(room.tile_points(len(filtered.codes), 0), output.parent)
             result = _pieces(input, job, filtered, mark)
@@ -176,8 +180,12 @@ def filter_file(
 
 
 @contextmanager
-def _scratch(output: Path) -> Iterator[Path]:
-    """Yield a folder beside `output` that may be made, and is gone afterwards."""
+def _scratch(output: Path, work: Path | None, facts: str) -> Iterator[Path]:
+    """Yield a folder for tiles: in `work`, named by what they depend on, or one that goes again."""
+    if work is not None:
+        told = f"{dougong.__version__} {facts}"
+        yield work / f"tiles-{hashlib.sha256(told.encode()).hexdigest()[:16]}"
+        return
     folder = output.with_name(f"tiles-{output.name}-{os.getpid()}")
     try:
         yield folder
