@@ -21,7 +21,8 @@ Arrays = dict[str, NDArray[Any]]
 Record = dict[str, Any]
 POINTS = "points"
 """The stage that holds ``xyz``, ``row`` and, after a voxel grid, ``voxel_count``."""
-_INDEX = "tiles.json"
+INDEX = "tiles.json"
+"""The file that says that the tiles are whole: it is written last."""
 _RECORD = "record"
 
 
@@ -66,12 +67,12 @@ class TiledCloud:
     def save(self) -> None:
         """Write down that the tiles are whole."""
         told = {"tiles": self.tiles, "facts": dict(self.facts)}
-        _replace(self.folder / _INDEX, lambda part: part.write_text(json.dumps(told), "utf-8"))
+        _replace(self.folder / INDEX, lambda part: part.write_text(json.dumps(told), "utf-8"))
 
 
 def load_tiles(folder: Path) -> TiledCloud | None:
     """Return the tiles that an earlier run left whole in `folder`, or None."""
-    index = folder / _INDEX
+    index = folder / INDEX
     if not index.is_file():
         return None
     told = json.loads(index.read_text(encoding="utf-8"))

@@ -76,7 +76,11 @@ class TileBench:
             Some tiles failed, or the disk is full.
         """
         start = time.perf_counter()
-        stage = _Stage(self.cloud, self.engine, self.state, params, among)
+        asked = sum(
+            int(is_asked(state_of(self.cloud.folder, tile, self.state), among).sum())
+            for tile in self.cloud.tiles
+        )
+        stage = _Stage(self.cloud, self.engine, self.state, params, among, asked)
         records, notes, self.state = _RUN[name](stage)
         totals = {key: sum(r[key] for r in records) for key in ("left", "asked", "taken")}
         found = StageDone(name=name, notes=notes, seconds=time.perf_counter() - start, **totals)
@@ -93,6 +97,8 @@ class _Stage:
     before: str
     params: Parameters
     among: Among
+    asked: int
+    """How many points it is asked about."""
 
     def key(self, name: str, known: Any = None) -> str:
         """Return the name of a step of this stage: a hash of all that its result depends on."""
@@ -108,7 +114,7 @@ class _Stage:
             before=self.before,
             params=self.params,
             among=self.among,
-            asked=self.asked(),
+            asked=self.asked,
             known=known,
         )
         folder = self.cloud.folder
@@ -122,10 +128,6 @@ class _Stage:
         """Return which points of a tile are asked about, and their state."""
         state = state_of(self.cloud.folder, tile, self.before)
         return is_asked(state, self.among), state
-
-    def asked(self) -> int:
-        """Return how many points the stage is asked about."""
-        return sum(int(self.mask_and_state(tile)[0].sum()) for tile in self.cloud.tiles)
 
     def blocks(self) -> Any:
         """Yield the points that the stage is asked about, tile by tile."""
@@ -143,7 +145,7 @@ class _Stage:
         path = self.cloud.folder / f"whole.{self.key(name)}.npz"
         record = read_record(path)
         if record is None:
-            arrays, record = make(self.asked())
+            arrays, record = make(self.asked)
             write_arrays(path, arrays, record)
         return path, record
 
@@ -231,7 +233,7 @@ def _curvature_weighted(stage: _Stage) -> Outcome:
 
 
 def _protective(stage: _Stage, params: CurvatureWeighted) -> Outcome:
-    asked = stage.asked()
+    asked = stage.asked
     reach = params.reach_m
     if reach is None:
         _, found = stage.map("eighth", work.nearest, protective.TESTS)

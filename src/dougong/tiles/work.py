@@ -6,6 +6,7 @@ it. Of the points of a tile and its halo only those that a stage is asked about 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -35,7 +36,16 @@ from dougong.filters.statistical import (
 )
 from dougong.filters.totals import Totals
 from dougong.params import Parameters
-from dougong.tiles.cloud import POINTS, Arrays, Record, Tile, TiledCloud, load_tiles, read_arrays
+from dougong.tiles.cloud import (
+    INDEX,
+    POINTS,
+    Arrays,
+    Record,
+    Tile,
+    TiledCloud,
+    load_tiles,
+    read_arrays,
+)
 from dougong.typing import Mask, Points, Values
 
 Among = Literal["left", "off_ground"]
@@ -91,7 +101,14 @@ def asked_points(job: Job, tile: Tile) -> Points:
 
 
 def _cloud(job: Job) -> TiledCloud:
-    cloud = load_tiles(job.folder)
+    return _read_tiles(job.folder, (job.folder / INDEX).stat().st_mtime_ns)
+
+
+@lru_cache(4)
+def _read_tiles(folder: Path, written_ns: int) -> TiledCloud:
+    """Return the tiles of a folder, read once: a cloud may have thousands."""
+    del written_ns
+    cloud = load_tiles(folder)
     assert cloud is not None
     return cloud
 
