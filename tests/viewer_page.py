@@ -92,7 +92,10 @@ def change(first, second):
 def settled(page, seconds=20):
     """Wait until a page of `dougong view` has read all that its picture wants."""
     for _ in range(4 * seconds):
-        if page.tab.evaluate("() => dougongViewer.streamer.isDone === true"):
+        # Drawn first: a picture that has changed since is asked for only when it is drawn.
+        if page.tab.evaluate(
+            "() => { dougongViewer.stage.draw(); return dougongViewer.streamer.isDone === true; }"
+        ):
             return
         page.tab.wait_for_timeout(250)
     raise AssertionError("the streamer did not come to rest")
