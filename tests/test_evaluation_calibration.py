@@ -13,6 +13,7 @@ from dougong.evaluation.calibration import (
     reliability,
 )
 from dougong.evaluation.studies import Setting, measured
+from dougong.evaluation.studies.probability import FIRST_SEED
 from dougong.evaluation.trial_pairs import KINDS, TRAINED, make_pair
 from dougong.pipeline.progress import Silent
 from dougong.registration.probability import BELIEF, MOST_PROBABLE, Belief, Evidence
@@ -36,7 +37,7 @@ def test_pairs_are_a_function_of_kind_and_seed_and_the_truth_lays_one_on_the_oth
 
 
 def test_at_least_three_pairs_in_ten_have_no_single_answer():
-    pairs = [make_pair(kind, seed) for kind in KINDS for seed in range(8)]
+    pairs = [make_pair(kind, seed) for kind in KINDS for seed in range(FIRST_SEED, FIRST_SEED + 30)]
     assert np.mean([pair.is_unique for pair in pairs]) <= 0.7
     assert any(pair.truth is None for pair in pairs)
 
@@ -44,7 +45,7 @@ def test_at_least_three_pairs_in_ten_have_no_single_answer():
 def test_ends_that_are_alike_are_not_taken_for_one_another():
     # The scan shows one end of a plain hall, the drone the other: the pose that lays end on end
     # shares more than the true one, and was called ok.
-    row = measure("rectangle", 1, SETTINGS)
+    row = measure("rectangle", 37, SETTINGS)
     assert row["status"] != "ok"
     assert row["probability"] < 0.7
 

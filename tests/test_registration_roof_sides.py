@@ -3,11 +3,15 @@
 import numpy as np
 
 from dougong.registration import Register, register
+from dougong.registration.evidence import summon
+from dougong.registration.prepare import Prepare, prepare
+from dougong.registration.roof_sides import ground_agrees, height_left_open
 from registration_sites import (
     L_PLAN,
     SETTINGS,
     _inside,
     as_cloud,
+    local_truth,
     motion,
     moved,
     pose_error,
@@ -50,3 +54,27 @@ def test_ground_in_both_clouds_holds_the_height():
     found, error = registered(with_soffit(0), flown(0, has_ground=True))
     assert found.status == "ok"
     assert error[2] < 0.03
+
+
+def test_thin_clouds_with_ground_are_decided_by_the_ground():
+    """Points as far apart as a roof is thick: nothing else prefers one height by enough."""
+    clouds = as_cloud(site("lidar", 0)), as_cloud(flown(0, has_ground=True))
+    source = prepare(clouds[0], "lidar", Prepare(min_spacing_m=0.4))
+    target = prepare(clouds[1], "photogrammetry", Prepare(min_spacing_m=0.4))
+    T = local_truth(TRUTH, *clouds)
+    court = summon(source, target)
+    assert height_left_open(court, source, target, T) is None
+    T[2, 3] += THICKNESS_M
+    assert height_left_open(court, source, target, T) < 0.0
+
+
+def test_ground_that_differs_by_a_roof_is_no_proof():
+    clouds = as_cloud(with_soffit(0)), as_cloud(flown(0, has_ground=True))
+    source = prepare(clouds[0], "lidar", SETTINGS)
+    target = prepare(clouds[1], "photogrammetry", SETTINGS)
+    T = local_truth(TRUTH, *clouds)
+    assert ground_agrees(summon(source, target), source, target, T)
+    for height in (0.15, -0.25):
+        raised = T.copy()
+        raised[2, 3] += height
+        assert not ground_agrees(summon(source, target), source, target, raised)

@@ -2,8 +2,9 @@
 
 A scan without its stations shows a roof, and nothing beneath it: a roof that was seen from a tower,
 or a soffit over a closed room. The drone shows the top. Both readings fit, apart by the roof's
-thickness, and every block of the building agrees about the wrong one. So the pose is held against
-itself, raised and lowered, by all that is not such a roof: ground, sills, ledges.
+thickness, and every block of the building agrees about the wrong one. Ground that both clouds show
+decides: no instrument sees it from below. Where it is missing, the pose is held against itself,
+raised and lowered, by all that is not such a roof: sills, ledges, walls.
 """
 
 from __future__ import annotations
@@ -14,14 +15,20 @@ from typing import Literal
 import numpy as np
 
 from dougong.filters import neighbourhood
+from dougong.registration.covariance import blocks_of
 from dougong.registration.evidence import Court, Witness, hear
 from dougong.registration.overlap import apply, inverse
 from dougong.registration.prepare import Prepared
-from dougong.typing import Mask, Transform
+from dougong.typing import Mask, Points, Transform, Values
 
 _HEIGHTS_M = (0.15, -0.15, 0.25, -0.25, 0.4, -0.4)
 """How thick roofs are."""
 _REACH_M = 0.7
+_BLOCK_M = 5.0
+_LEAST_BLOCKS = 5
+"""Ground in fewer places may be a terrace, a floor or a parked car."""
+_AGREES_M = 0.05
+"""A third of the thinnest roof: ground as far apart as this is on the same side of it."""
 
 
 def height_left_open(
@@ -49,6 +56,8 @@ def height_left_open(
     unknown = (_is_unknown(source, court.source), _is_unknown(target, court.target))
     if source.kind == target.kind or not (unknown[0].any() or unknown[1].any()):
         return None
+    if ground_agrees(court, source, target, T):
+        return None
     kept = replace(
         court,
         source=_silenced(court.source, court.target, T, unknown[0], target),
@@ -61,6 +70,44 @@ def height_left_open(
         if hear(kept, raised).total <= loss:
             return height
     return None
+
+
+def ground_agrees(court: Court, source: Prepared, target: Prepared, T: Transform) -> bool:
+    """Say whether the ground of both clouds is at one height: by the medians of 5 m blocks."""
+    points = apply(T, court.source.points[_is_ground(source, court.source)])
+    target_is_ground = target.is_ground[court.target.everything.index]
+    index, _ = neighbourhood.nearest(court.target.everything.neighbours, points, _REACH_M)
+    pairs = (index >= 0) & target_is_ground[np.maximum(index, 0)]
+    points, index = points[pairs], index[pairs]
+    if not len(points):
+        return False
+    normals = court.target.everything.normals[index]
+    tilt = normals @ target.up
+    offset = np.einsum("ij,ij->i", normals, points - court.target.everything.xyz[index])
+    # Along the vertical; a normal far from it is no ground's.
+    is_level = np.abs(tilt) > 0.5
+    heights = _block_medians(points[is_level], (offset / np.where(tilt, tilt, 1.0))[is_level])
+    if len(heights) < _LEAST_BLOCKS:
+        return False
+    middle = float(np.median(heights))
+    spread = 1.4826 * float(np.median(np.abs(heights - middle))) / np.sqrt(len(heights))
+    return bool(abs(middle) + 2.0 * spread <= _AGREES_M)
+
+
+def _block_medians(points: Points, values: Values) -> Values:
+    """Return the median of `values` (n,) in every block that holds three of `points` or more."""
+    if not len(points):
+        return np.zeros(0)
+    block, count = blocks_of(points, _BLOCK_M)
+    order = np.argsort(block, kind="stable")
+    parts = np.split(values[order], np.searchsorted(block[order], np.arange(1, count)))
+    return np.array([np.median(part) for part in parts if len(part) >= 3])
+
+
+def _is_ground(cloud: Prepared, witness: Witness) -> Mask:
+    heard = witness.everything.index[witness.everything.asked]
+    is_ground: Mask = cloud.is_ground[heard]
+    return is_ground
 
 
 def weigh_height(reason: str, left_open_m: float | None) -> tuple[Literal["ok", "ambiguous"], str]:
