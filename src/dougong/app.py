@@ -373,6 +373,7 @@ def evaluate(
     seed: int,
     is_quick: bool,
     runs: int | None,
+    points: int | None,
     data: Path | None,
     overwrite: bool,
     progress: Progress,
@@ -383,7 +384,9 @@ def evaluate(
 
     if runs is not None and runs < 1:
         raise InputError(f"--runs must be 1 or more, got {runs}.")
-    setting = Setting(seed=seed, runs=runs, is_quick=is_quick, data=data)
+    if points is not None and points < 10_000:
+        raise InputError(f"--points must be 10,000 or more, got {points:,}.")
+    setting = Setting(seed=seed, runs=runs, is_quick=is_quick, points=points, data=data)
     folder = Path(f"dougong-{study}") if out is None else _named(out)
     return verb(study, folder, setting, overwrite=overwrite, progress=progress)
 

@@ -11,12 +11,13 @@ from dougong.cli._shell import Answer, Listener, execute
 
 
 def command(
-    study: Literal["denoise", "probability", "hard"],
+    study: Literal["denoise", "probability", "hard", "buildings"],
     /,
     *,
     out: Path | None = None,
     quick: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     runs: int | None = None,
+    points: int | None = None,
     data: Path | None = None,
     overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     common: Common = DEFAULT,
@@ -32,12 +33,16 @@ def command(
     study
         denoise: noise filters, noise removed against carving kept. probability: the verdict's
         probability against how often it is right. hard: hard and impossible pairs.
+        buildings: five kinds of building through the whole program, against the truth.
     out
         Folder for the files; default: dougong-STUDY in the current folder.
     quick
         Small samples, few runs: a look, not a measurement.
     runs
         How often each sample is drawn anew; default: as the study says.
+    points
+        Points of a scanner's cloud, of the largest where sizes are compared; default: as the
+        study says.
     data
         Folder of real scans that the study also uses.
     overwrite
@@ -51,6 +56,7 @@ def command(
             seed=common.seed,
             is_quick=quick,
             runs=runs,
+            points=points,
             data=data,
             overwrite=overwrite,
             progress=progress,

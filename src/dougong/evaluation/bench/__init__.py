@@ -6,10 +6,8 @@ Seconds are medians over the repeats; CPU seconds hold on a loaded machine, wall
 Memory is the peak of resident memory beyond what was held before, the points being held.
 """
 
-import hashlib
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -17,24 +15,22 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import dougong
 from dougong.errors import InputError, OutputError
 from dougong.evaluation.bench.contenders import OPERATIONS, Contender, absent
 from dougong.evaluation.bench.scenes import SCENES
 from dougong.evaluation.bench.table import as_text
+from dougong.evaluation.machine import code_hash, machine, version_of
 from dougong.pipeline.outputs import watched, write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import software
 
 _FEWEST, _MOST = 30_000, 1_000_000_000
 _POOLS = ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "VECLIB")
-_DISTRIBUTIONS = {"CSF": "cloth-simulation-filter", "small_gicp": "small-gicp"}
 _ROOMS = ("kernels", "filters", "registration")
 """What our figures depend on: a change there makes old ones void."""
 
@@ -158,40 +154,15 @@ def _measured(file: Path, about: dict[str, Any]) -> dict[str, Any]:
 
 def _about() -> dict[str, Any]:
     """Return who and where: versions, machine, and the hash of our own code."""
-    digest = hashlib.sha256()
-    package = Path(dougong.__file__).parent
-    for room in _ROOMS:
-        for path in sorted((package / room).rglob("*.py")):
-            digest.update(path.read_bytes())
     everyone = [c for operation in OPERATIONS.values() for c in operation.contenders]
     peers = sorted({c.package for c in everyone if c.is_installed and not c.is_program})
     return {
-        "machine": {"processor": _processor(), "cores": os.cpu_count(), "memory_gb": _memory_gb()},
-        "code": digest.hexdigest()[:16],
+        "machine": machine(),
+        "code": code_hash(_ROOMS),
         "software": software(),
-        "peers": {name: _version(name) for name in peers if name != "dougong"},
+        "peers": {name: version_of(name) for name in peers if name != "dougong"},
         "absent": absent(),
     }
-
-
-def _version(package: str) -> str:
-    try:
-        return version(_DISTRIBUTIONS.get(package, package))
-    except PackageNotFoundError:
-        return "unknown"
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
-def _memory_gb() -> int | None:
-    if not hasattr(os, "sysconf"):
-        return None
-    return round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9)
 
 
 def _group(

@@ -20,33 +20,18 @@ import numpy as np
 from dougong.evaluation.bench.contenders import OPERATIONS
 from dougong.evaluation.bench.ours import Arrays
 from dougong.evaluation.bench.programs import Cost
+from dougong.evaluation.machine import forget_peak, resident_bytes
 from dougong.threads import set_threads
 
 _WARM_UP = 20_000
-
-
-def _memory(field: str) -> int:
-    """Return a memory figure of this process, bytes; 0 where the system does not tell."""
-    try:
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return 0
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(field)), 0)
-
-
-def _forget_peak() -> None:
-    """Let the peak of resident memory start from what is resident now (Linux)."""
-    clear = Path("/proc/self/clear_refs")
-    if clear.exists():
-        clear.write_text("5", encoding="ascii")
 
 
 def measure(operation: str, name: str, arrays: Arrays, threads: int) -> dict[str, Any]:
     """Do the work once; return seconds, bytes beyond what was held before, and the answer."""
     work = OPERATIONS[operation]
     contender = next(c for c in work.contenders if c.name == name)
-    _forget_peak()
-    held = _memory("VmRSS")
+    forget_peak()
+    held = resident_bytes("VmRSS")
     wall, cpu = time.perf_counter(), time.process_time()
     result = contender.run(arrays, threads)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
@@ -57,7 +42,7 @@ def measure(operation: str, name: str, arrays: Arrays, threads: int) -> dict[str
             "bytes": result.peak_bytes,
             "answer": {},
         }
-    beyond = max(0, _memory("VmHWM") - held)
+    beyond = max(0, resident_bytes("VmHWM") - held)
     return {"wall_s": wall, "cpu_s": cpu, "bytes": beyond, "answer": work.answer(result, arrays)}
 
 

@@ -1,19 +1,24 @@
 """Studies: each reproduces one table or figure. One module per study, called as the command does.
 
 A study's module has ``study(setting, progress) -> Findings``. Add a module, its line in `STUDIES`
-and its name in ``cli/evaluate.py``, and ``dougong evaluate NAME`` runs it.
+and its name in ``cli/evaluate.py``, and ``dougong evaluate NAME`` runs it. Every row it measures
+names its ``seed``; what it is measured against and the version are added to all rows here.
 """
 
 import csv
 import io
 import json
+import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import dougong
 from dougong.errors import InputError, OutputError
+from dougong.evaluation.machine import code_hash, machine
+from dougong.evaluation.tabulate import new_figure
 from dougong.pipeline.outputs import refuse_existing, watched, write_json, write_text
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import software
@@ -23,8 +28,12 @@ STUDIES: Mapping[str, str] = {
     "denoise": "noise filters: noise removed against carving kept",
     "probability": "the verdict's probability against how often it is right",
     "hard": "hard and impossible pairs: right, ambiguous, failed, wrong",
+    "buildings": "five kinds of building through the whole program, against the truth",
 }
 """Every study by its name, with what it measures."""
+
+_ROOMS = ("kernels", "filters", "formats", "registration", "pipeline", "evaluation")
+"""What the figures depend on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +46,9 @@ class Setting:
     """How often each sample is drawn anew; None: as many as the study says."""
     is_quick: bool = False
     """Small samples and few runs: a look, not a measurement."""
+    points: int | None = None
+    """Points of a scanner's cloud (the largest, where sizes are compared); None: as the study
+    says."""
     data: Path | None = None
     """Folder of real scans."""
     kept: Path | None = None
@@ -56,6 +68,8 @@ class Findings:
     """Every single measurement, plain."""
     table: Sequence[Mapping[str, Any]]
     """What is read: means and spreads. Becomes the CSV file; all rows have the same keys."""
+    against: str
+    """What the figures are measured against: one sentence that goes into every row."""
     text: str
     """The table for a terminal."""
     draw: Callable[[Path], None]
@@ -137,21 +151,14 @@ def evaluate(
     if overwrite:
         kept.unlink(missing_ok=True)
     setting = replace(setting, kept=kept)
+    # Without what draws the figure a study would fail after hours of work.
+    new_figure(1.0, 1.0)
     found: Findings = import_module(f"dougong.evaluation.studies.{name}").study(setting, progress)
-    document = finite(
-        {
-            "study": name,
-            "about": STUDIES[name],
-            "seed": setting.seed,
-            "runs": setting.runs,
-            "is_quick": setting.is_quick,
-            "data": None if setting.data is None else str(setting.data),
-            "table": [dict(row) for row in found.table],
-            "software": software(),
-        }
-    )
+    document = finite(_document(name, setting, found))
     with watched(*files):
-        write_json(files[0], {**document, "rows": finite(list(found.rows))})
+        told = {"measured_against": found.against, "version": dougong.__version__}
+        rows = [{**told, **row} for row in found.rows]
+        write_json(files[0], {**document, "rows": finite(rows)})
         write_text(files[1], _csv(found.table))
         part = files[2].with_name(f".{name}.part.png")
         try:
@@ -166,6 +173,25 @@ def evaluate(
             part.unlink(missing_ok=True)
     kept.unlink(missing_ok=True)
     return {**document, "files": [str(file) for file in files]}, found.text
+
+
+def _document(name: str, setting: Setting, found: Findings) -> dict[str, Any]:
+    """Return what NAME.json says beside the single rows."""
+    return {
+        "study": name,
+        "about": STUDIES[name],
+        "measured_against": found.against,
+        "version": dougong.__version__,
+        "code": code_hash(_ROOMS),
+        "machine": {**machine(), "system": platform.platform()},
+        "software": software(),
+        "seeds": sorted({row["seed"] for row in found.rows if "seed" in row}),
+        "runs": setting.runs,
+        "is_quick": setting.is_quick,
+        "points": setting.points,
+        "data": None if setting.data is None else str(setting.data),
+        "table": [dict(row) for row in found.table],
+    }
 
 
 def _csv(table: Sequence[Mapping[str, Any]]) -> str:

@@ -40,7 +40,7 @@ def study(setting: Setting, progress: Progress) -> Findings:
     rows: list[dict[str, Any]] = []
     for run, sample in _samples(setting):
         progress.stage(f"{sample.name}, run {run}: {len(sample.points):,} points")
-        about = {"sample": sample.name, "run": run, "points": len(sample.points)}
+        about = {"sample": sample.name, "run": run, "seed": run, "points": len(sample.points)}
         for method in METHODS:
             found = rates(method.is_kept(sample.points), sample)
             rows.append({**about, "filter": method.name, **found})
@@ -50,6 +50,7 @@ def study(setting: Setting, progress: Progress) -> Findings:
     return Findings(
         rows=rows,
         table=_table(measured),
+        against="the labels of the generated noise and features, known for every point",
         text=_text(measured),
         draw=lambda path: draw_curves(rows, path),
     )

@@ -49,7 +49,11 @@ def study(setting: Setting, progress: Progress) -> Findings:
     rows = measured(setting, keys, measure, progress)
     table = summary(rows)
     return Findings(
-        rows=rows, table=table, text=text(table), draw=lambda path: draw_verdicts(table, path)
+        rows=rows,
+        table=table,
+        against="the true pose of each pair and the answer that its case must get",
+        text=text(table),
+        draw=lambda path: draw_verdicts(table, path),
     )
 
 

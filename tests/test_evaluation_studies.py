@@ -1,0 +1,75 @@
+"""The studies of the paper's tables and figures: that they measure what they say."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dougong.cli import call
+from dougong.evaluation import building_runs
+from dougong.evaluation.metrics import pose_errors
+from dougong.evaluation.studies import buildings
+from dougong.evaluation.tabulate import as_text, spread
+
+
+@pytest.mark.parametrize("pair", building_runs.PAIRS)
+def test_pairs_are_drawn_by_seed_and_their_truth_lays_one_on_the_other(pair):
+    made = building_runs.PAIRS[pair]("hall", 1, 5_000)
+    errors = pose_errors(made.truth.T_best, made.truth)
+    assert errors.tre95_m < 1e-6
+    if made.is_scan:
+        assert errors.bending_floor95_m < 1e-6
+    else:
+        assert 0.001 < errors.bending_floor95_m < 0.05
+    again = building_runs.PAIRS[pair]("hall", 1, 5_000)
+    np.testing.assert_array_equal(made.target.xyz, again.target.xyz)
+
+
+def building_row(seed, **values):
+    usual = {"pair": "two scanners", "building": "hall", "seed": seed, "status": "ok"}
+    usual |= dict.fromkeys(buildings.FIGURES, 2.0)
+    usual |= {
+        f"{name}_points_{when}": 100
+        for name in ("source", "target")
+        for when in ("before", "after")
+    }
+    usual |= {"is_correct": True, "pose_level": "LOA40", "total_level": "LOA30"}
+    return {**usual, "peak_memory_bytes": 5, **values}
+
+
+def test_the_table_of_buildings_tells_spread_seeds_and_the_worst_level():
+    rows = [
+        building_row(0),
+        building_row(1, pose95_mm=90.0, total95_mm=91.0, is_correct=False, total_level="LOA10"),
+        building_row(2, status="ambiguous", is_correct=False),
+    ]
+    (line,) = buildings.summary(rows)
+    assert (line["n"], line["ok"], line["wrong"], line["seeds"]) == (3, 2, 1, "0 1 2")
+    assert (line["pose95_mm_min"], line["pose95_mm"], line["pose95_mm_max"]) == (2.0, 2.0, 90.0)
+    assert line["total_level"] == "LOA10"
+
+
+def test_a_study_writes_every_row_with_what_it_is_measured_against(tmp_path, monkeypatch):
+    monkeypatch.setattr(buildings, "run_pair", lambda made, _: building_row(made[1]))
+    fake = {"scanner and drone": lambda kind, seed, points: (kind, seed, points)}
+    monkeypatch.setattr(buildings, "PAIRS", fake)
+    job = ["evaluate", "buildings", "--quick", "--runs", "2", "--quiet", "--out", str(tmp_path)]
+    assert call(job) == 0
+    document = json.loads((tmp_path / "buildings.json").read_text())
+    assert document["seeds"] == [0, 1]
+    assert document["machine"]["cores"] >= 1
+    assert document["software"]["dougong"] == document["version"]
+    for row in document["rows"]:
+        assert row["measured_against"] == buildings.AGAINST
+        assert row["version"] == document["version"]
+    assert (tmp_path / "buildings.png").stat().st_size > 5000
+    assert "pose95_mm" in (tmp_path / "buildings.csv").read_text()
+
+
+def test_spreads_leave_out_what_is_not_known():
+    rows = [{"x": 1.0}, {"x": None}, {"x": 3.0}, {}]
+    assert spread(rows, "x") == {"x": 2.0, "x_min": 1.0, "x_max": 3.0}
+    assert spread([{}], "x") == {"x": None, "x_min": None, "x_max": None}
+    assert as_text([{"x": None, "y": 12345}], {"x": "one", "y": "two"}).splitlines()[1] == (
+        "-    12,345"
+    )
