@@ -8,7 +8,8 @@ import pytest
 from dougong.cli import call
 from dougong.evaluation import building_runs
 from dougong.evaluation.metrics import pose_errors
-from dougong.evaluation.studies import buildings
+from dougong.evaluation.scenes import make_scene
+from dougong.evaluation.studies import buildings, filtering, storage
 from dougong.evaluation.tabulate import as_text, spread
 
 
@@ -73,3 +74,34 @@ def test_spreads_leave_out_what_is_not_known():
     assert as_text([{"x": None, "y": 12345}], {"x": "one", "y": "two"}).splitlines()[1] == (
         "-    12,345"
     )
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene("hall", 3, lidar_points=12_000, photogrammetry_points=4_000)
+
+
+def test_deeper_octrees_take_less_and_cover_more(scene):
+    surface = scene.truth.surface_points - scene.lidar.frame.origin
+    before = filtering._gaps(scene.lidar.xyz, surface)
+    found = [filtering._thinned(scene.lidar, depth, surface, before) for depth in (7, 9, 20)]
+    for key, sign in (("reduction_percent", -1), ("completeness_percent", 1), ("gap95_mm", -1)):
+        assert (sign * np.diff([row[key] for row in found]) > 0).all()
+    assert found[-1]["completeness_percent"] == 100.0
+    assert found[-1]["gap95_mm"] <= 1e3 * filtering.COVER_M
+
+
+def test_a_higher_cloth_threshold_takes_ground_and_then_building(scene):
+    low, high = (filtering._parted(scene.lidar, threshold) for threshold in (0.05, 0.5))
+    assert low["ground_missed_percent"] > high["ground_missed_percent"]
+    assert low["building_lost_percent"] < high["building_lost_percent"]
+    assert low["points_before"] == low["points_after"] + round(
+        low["reduction_percent"] * low["points_before"] / 100.0
+    )
+
+
+def test_bytes_are_those_of_files(scene, tmp_path):
+    half = scene.photogrammetry.select(np.arange(0, len(scene.photogrammetry), 2))
+    whole, part = storage._sizes(scene.photogrammetry), storage._sizes(half)
+    assert set(whole) == set(storage.WRITABLE)
+    assert all(0.4 < part[suffix] / whole[suffix] < 0.7 for suffix in whole)

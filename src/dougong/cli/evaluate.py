@@ -11,7 +11,14 @@ from dougong.cli._shell import Answer, Listener, execute
 
 
 def command(
-    study: Literal["denoise", "probability", "hard", "buildings"],
+    study: Literal[
+        "denoise",
+        "probability",
+        "hard",
+        "buildings",
+        "filtering",
+        "storage",
+    ],
     /,
     *,
     out: Path | None = None,
@@ -34,6 +41,8 @@ def command(
         denoise: noise filters, noise removed against carving kept. probability: the verdict's
         probability against how often it is right. hard: hard and impossible pairs.
         buildings: five kinds of building through the whole program, against the truth.
+        filtering: octree depth and cloth threshold, and what each costs. storage: bytes before
+        and after, by format.
     out
         Folder for the files; default: dougong-STUDY in the current folder.
     quick

@@ -29,6 +29,8 @@ STUDIES: Mapping[str, str] = {
     "probability": "the verdict's probability against how often it is right",
     "hard": "hard and impossible pairs: right, ambiguous, failed, wrong",
     "buildings": "five kinds of building through the whole program, against the truth",
+    "filtering": "octree depth and cloth threshold: reduction, and what it costs",
+    "storage": "bytes on disk before and after, by format",
 }
 """Every study by its name, with what it measures."""
 
