@@ -6,7 +6,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from dougong.cloud import Cloud
+from dougong.cloud import Cloud, joined_pieces
+from dougong.formats.model import Hold
 from dougong.pipeline.merging import REASON, Merge, Part, better_first, choose
 from dougong.pipeline.zones import grid_over, zones_of
 
@@ -113,10 +114,17 @@ def parts_of(scan, drone):
     clouds = [Cloud.from_points(p + [5e5, 4e6, 30], name=f"scan {k}") for k, p in enumerate(points)]
     clouds.append(Cloud.from_points(drone + [5e5, 4e6, 30], name="drone"))
     return [
-        Part(cloud=clouds[0], source_id=1, name="scans", kind="lidar"),
-        Part(cloud=clouds[1], source_id=1, name="scans", kind="lidar"),
-        Part(cloud=clouds[2], source_id=2, name="drone", kind="photogrammetry"),
+        part_of(clouds[0], source_id=1, name="scans", kind="lidar"),
+        part_of(clouds[1], source_id=1, name="scans", kind="lidar"),
+        part_of(clouds[2], source_id=2, name="drone", kind="photogrammetry"),
     ]
+
+
+def part_of(cloud, **told):
+    """A part that comes in two pieces."""
+    halves = np.array_split(np.arange(len(cloud)), 2)
+    pieces = lambda: (cloud.select(half) for half in halves)  # noqa: E731
+    return Part(frame=cloud.frame, points=len(cloud), pieces=pieces, **told)
 
 
 def test_the_choice_knows_no_order_of_parts_or_points_and_no_offset(seam):
@@ -126,8 +134,26 @@ def test_the_choice_knows_no_order_of_parts_or_points_and_no_offset(seam):
     np.testing.assert_array_equal(kept[2], better_first(scan, drone, QUICK).kept_other)
     np.testing.assert_array_equal(choose(parts[::-1], QUICK).kept[0], kept[2])
     turn = np.random.default_rng(3).permutation(len(drone))
-    mixed = [*parts[:2], replace(parts[2], cloud=parts[2].cloud.select(turn))]
+    cloud = joined_pieces(parts[2].pieces).select(turn)
+    mixed = [*parts[:2], replace(parts[2], pieces=lambda: (cloud,))]
     np.testing.assert_array_equal(choose(mixed, QUICK).kept[2], kept[2][turn])
+
+
+@pytest.mark.parametrize("most", [300, 2000])
+def test_tiles_with_halos_choose_as_the_whole(seam, tmp_path, most):
+    rng = np.random.default_rng(5)
+    # A far part where the drone is the better one, so that either side loses points.
+    scan = np.vstack([seam[0], wall(rng, 3, 900, 0.03, start=7.0)])
+    drone = np.vstack([seam[1], wall(rng, 4, 500, 0.01, start=6.0)])
+    parts = parts_of(scan, drone)
+    for params in (QUICK, Merge()):
+        one, other = choose(parts, params), choose(parts, params, Hold(most, tmp_path / "t"))
+        assert one.reach_m == other.reach_m
+        for kept, again in zip(one.kept, other.kept, strict=True):
+            np.testing.assert_array_equal(kept, again)
+        assert not one.kept[1].all()
+        assert not one.kept[2].all()
+    assert len(list(tmp_path.rglob("*.points.npz"))) >= 4
 
 
 def test_every_point_is_counted_and_comes_back(seam):

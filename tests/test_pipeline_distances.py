@@ -9,9 +9,9 @@ import pytest
 from dougong.cloud import Cloud
 from dougong.formats import read, write_merged
 from dougong.pipeline.distances import (
+    Painter,
     distances_document,
     measure,
-    with_distances,
     write_distances,
 )
 from dougong.pipeline.registrations import finite
@@ -122,7 +122,7 @@ def test_the_core_points_are_a_file_others_can_open(measured, tmp_path):
 def test_merged_points_carry_the_distance_of_their_place(pair, measured, tmp_path):
     source, target = pair
     moved = source.moved(pose().matrix, target.frame)
-    clouds = [with_distances(moved, [measured]), with_distances(target, [measured])]
+    clouds = [Painter([measured]).painted(moved), Painter([measured]).painted(target)]
     write_merged(clouds, tmp_path / "merged.copc.laz", source_ids=[1, 2])
     back = read(tmp_path / "merged.copc.laz")
     distance = back.attribute("m3c2_distance")
@@ -133,7 +133,7 @@ def test_merged_points_carry_the_distance_of_their_place(pair, measured, tmp_pat
         own = north & (back.attribute("source_id") == source_id)
         assert np.isfinite(distance[own]).mean() > 0.95
         assert np.nanmedian(distance[own]) == pytest.approx(0.014, abs=0.001)
-    nowhere = with_distances(target, [])
+    nowhere = Painter([]).painted(target)
     assert np.isnan(nowhere.attribute("m3c2_distance")).all()
 
 

@@ -40,7 +40,7 @@ def test_small_clouds_stay_in_memory(site, capsys):
 
 def test_a_scan_that_does_not_fit_goes_on_tiles(site, capsys, monkeypatch):
     monkeypatch.setattr(memory, "BASE_BYTES", 0)
-    monkeypatch.setattr(memory, "_LEAST_TILE_POINTS", 100)
+    monkeypatch.setattr(memory, "LEAST_TILE_POINTS", 100)
     code, plan = planned(site, capsys, "--memory", "4MB")
     assert code == 0
     scan = plan["files"][0]

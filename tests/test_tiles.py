@@ -132,7 +132,7 @@ def little_room(monkeypatch):
     monkeypatch.setattr(memory, "BASE_BYTES", 0)
     monkeypatch.setattr(memory, "BYTES_PER_POINT", 5)
     monkeypatch.setattr(memory, "BYTES_PER_WAITING_POINT", 1)
-    monkeypatch.setattr(memory, "_LEAST_TILE_POINTS", 100)
+    monkeypatch.setattr(memory, "LEAST_TILE_POINTS", 100)
     monkeypatch.setattr(memory, "_BYTES_PER_BOOKED_POINT", 2)
     monkeypatch.setattr(memory, "_BYTES_PER_TILE_POINT", 12)
 
@@ -184,14 +184,6 @@ def test_run_is_the_same_on_tiles_and_goes_on_where_it_was(scan, tmp_path, littl
     assert results[1]["inputs"] == results[0]["inputs"]
 
 
-def test_a_grid_that_leaves_too_much_is_refused(scan, tmp_path, little_room, capsys, monkeypatch):
-    monkeypatch.setattr(memory, "BYTES_PER_POINT", 1000)
-    tokens = ["run", "--lidar", str(scan), "--out", str(tmp_path / "out")]
-    assert call([*tokens, "--memory", "190kB"]) == 2
-    assert "points are left after the voxel grid" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.filterwarnings("ignore")  # of the cluster's own
 def test_a_dask_cluster_gives_the_same(scan, tmp_path, little_room):
     pytest.importorskip("distributed")
@@ -211,7 +203,7 @@ from dougong.cli import call
 from dougong.pipeline import memory
 from dougong.tiles import engine
 
-memory.BASE_BYTES, memory.BYTES_PER_POINT, memory._LEAST_TILE_POINTS = 0, 5, 100
+memory.BASE_BYTES, memory.BYTES_PER_POINT, memory.LEAST_TILE_POINTS = 0, 5, 100
 memory._BYTES_PER_BOOKED_POINT, memory._BYTES_PER_TILE_POINT = 2, 12
 left, perform = int(sys.argv[1]), engine.perform
 

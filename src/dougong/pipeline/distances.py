@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dougong.cloud import Cloud, Frame
+from dougong.cloud import Cloud, Frame, Pieces
 from dougong.filters import neighbourhood
 from dougong.formats import write
 from dougong.formats.units import parse_crs
@@ -140,32 +140,39 @@ def write_distances(measured: Measured, path: Path) -> None:
     write(as_cloud(measured), path)
 
 
-def with_distances(cloud: Cloud, measured: Sequence[Measured]) -> Cloud:
-    """Return a cloud of the target's frame with ``m3c2_distance`` and ``m3c2_lod95``, float32.
+class Painter:
+    """Gives points the distance of the nearest core point that has one.
 
-    A point takes those of the nearest core point with a distance; NaN where there is none within
-    1.5 core spacings. Points of the reference take those of whichever registered cloud is nearest.
-
-    Parameters
-    ----------
-    cloud : Cloud
-    measured : sequence of Measured
-        Whose core points count; none: NaN everywhere.
+    ``m3c2_distance`` and ``m3c2_lod95``, float32; NaN where there is none within 1.5 core spacings.
+    Points of the reference take those of whichever registered cloud is nearest.
     """
-    distance = np.full(len(cloud), np.nan, dtype=np.float32)
-    lod = distance.copy()
-    nearest = np.full(len(cloud), np.inf)
-    for one in measured:
-        observed = one.signed.is_observed
-        index = neighbourhood.build_index(one.signed.core[observed])
-        at = cloud.rebased(one.frame.origin).xyz
-        reach = _TAKEN_FROM * one.signed.scales.core_spacing_m
-        place, away = neighbourhood.nearest(index, at, reach)
-        found = (place >= 0) & (away < nearest)
-        nearest[found] = away[found]
-        distance[found] = one.distance_m[observed][place[found]]
-        lod[found] = one.signed.lod95_m[observed][place[found]]
-    return cloud.with_attribute(DISTANCE, distance).with_attribute(LOD, lod)
+
+    def __init__(self, measured: Sequence[Measured]) -> None:
+        """Take the clouds whose core points count; none: NaN everywhere."""
+        self._measured = [
+            (one, neighbourhood.build_index(one.signed.core[one.signed.is_observed]))
+            for one in measured
+        ]
+
+    def painted(self, cloud: Cloud) -> Cloud:
+        """Return a cloud of the target's frame with its distances."""
+        distance = np.full(len(cloud), np.nan, dtype=np.float32)
+        lod = distance.copy()
+        nearest = np.full(len(cloud), np.inf)
+        for one, index in self._measured:
+            observed = one.signed.is_observed
+            at = cloud.rebased(one.frame.origin).xyz
+            reach = _TAKEN_FROM * one.signed.scales.core_spacing_m
+            place, away = neighbourhood.nearest(index, at, reach)
+            found = (place >= 0) & (away < nearest)
+            nearest[found] = away[found]
+            distance[found] = one.distance_m[observed][place[found]]
+            lod[found] = one.signed.lod95_m[observed][place[found]]
+        return cloud.with_attribute(DISTANCE, distance).with_attribute(LOD, lod)
+
+    def pieces(self, pieces: Pieces) -> Pieces:
+        """Return a cloud that comes in pieces with its distances."""
+        return lambda: (self.painted(piece) for piece in pieces())
 
 
 def distances_document(measured: Measured, file: str) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dougong.cloud import Cloud
+from dougong.cloud import Cloud, Frame, Pieces
 from dougong.pipeline.control import (
     control_of,
 )
@@ -13,7 +13,8 @@ from dougong.pipeline.distances import (
     Measured,
     measure,
 )
-from dougong.pipeline.loading import Mover
+from dougong.pipeline.kept import Kept
+from dougong.pipeline.movers import Mover, ReducedClouds
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.registering import register
 from dougong.registration import Register
@@ -47,11 +48,15 @@ class Linked:
             return np.eye(4)
         return self.result.matrix if self.is_sure else None
 
-    def in_reference(self, clouds: list[Cloud], reference: Cloud) -> list[Cloud]:
-        """Return its `clouds` in the reference's frame; where that is not known, in their own."""
+    def placed(self, cloud: Cloud, reference: Frame) -> Cloud:
+        """Return a cloud of it in the reference's frame; where that is not known, in its own."""
         if self.result is None or self.matrix is None:
-            return clouds
-        return [cloud.moved(self.matrix, reference.frame) for cloud in clouds]
+            return cloud
+        return cloud.moved(self.matrix, reference)
+
+    def placed_pieces(self, kept: Kept, reference: Frame) -> Pieces:
+        """Return what was kept of a file, placed, piece by piece."""
+        return lambda: (self.placed(piece, reference) for piece in kept.pieces())
 
 
 def register_pair(
@@ -77,10 +82,13 @@ def register_pair(
     return result
 
 
-def measured_link(link: Linked, reference: Mover, progress: Progress) -> Linked:
+def measured_link(
+    link: Linked, reference: Mover, clouds: ReducedClouds, progress: Progress
+) -> Linked:
     """Return a sure link with the distances that its registration leaves."""
     if link.result is None or not link.is_sure:
         return link
     progress.stage(f"measuring {link.mover.name} against {reference.name}")
-    found = measure(link.mover.joined(), reference.joined(), link.result)
+    source, target = clouds.of(link.mover.name).cloud, clouds.of(reference.name).cloud
+    found = measure(source, target, link.result)
     return replace(link, measured=found)

@@ -1,6 +1,6 @@
 """From a project's entries to the clouds that move: read, filtered, named."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -8,109 +8,30 @@ from typing import Any
 import numpy as np
 
 from dougong.cloud import Cloud
-from dougong.errors import FrameError
 from dougong.filters.selection import Reason
-from dougong.formats import describe, faults_of, in_system, is_same_crs, read, read_stations
+from dougong.formats import describe, faults_of, in_system, read, read_stations
 from dougong.formats.faults import NO_SYSTEM
-from dougong.pipeline.memory import Room
+from dougong.formats.model import Hold
+from dougong.pipeline.kept import Kept
+from dougong.pipeline.memory import LEAST_TILE_POINTS, Room
+from dougong.pipeline.movers import Mover, Source, Tally
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Entry, files_of
 from dougong.pipeline.provenance import Clock, sha256
 from dougong.pipeline.recipes import Recipe, filter_cloud, steps_of
 from dougong.pipeline.removed import removed_sample
+from dougong.pipeline.spooling import spooled
 from dougong.pipeline.steps import Filtered
-from dougong.pipeline.store import Store
+from dougong.pipeline.store import Books, Store
 from dougong.pipeline.tiled import (
     filter_chunks,
+    forget_tiles,
     is_too_large,
-    left_of,
     stations_of,
     tiled_job,
-    undecimated,
 )
 from dougong.registration.free_scale import ScaleSearch, with_unit, without_unit
 from dougong.registration.free_scale_result import refusal
-from dougong.typing import Kind
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Source:
-    """One file (or one station in it) after its filters."""
-
-    file: Path
-    station: int
-    filtered: Filtered
-    points_in: int
-    notes: tuple[str, ...]
-
-    removed: Cloud
-    """A sample of what the filters took out, see `removed_sample`."""
-
-    @property
-    def is_scan(self) -> bool:
-        """True: one scan of an E57 or PTX file, which moves by itself."""
-        return self.station >= 0 and hasattr(self.filtered.cloud.header, "station")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Mover:
-    """What moves as one: a cloud of the project, or one station of it."""
-
-    name: str
-    entry: str
-    kind: Kind
-    sources: tuple[Source, ...]
-    scale: ScaleSearch | None = None
-    """What brought its clouds to metres; None: their unit was known."""
-
-    @property
-    def clouds(self) -> list[Cloud]:
-        """The filtered clouds of the files."""
-        return [source.filtered.cloud for source in self.sources]
-
-    @property
-    def points_in(self) -> int:
-        """Points before the filters."""
-        return sum(source.points_in for source in self.sources)
-
-    @property
-    def points_out(self) -> int:
-        """Points after the filters."""
-        return sum(len(cloud) for cloud in self.clouds)
-
-    def joined(self) -> Cloud:
-        """Return all points as one cloud for the registration: coordinates only.
-
-        Raises
-        ------
-        FrameError
-            The files differ in coordinate system or unit.
-        """
-        return joined(self.clouds, self.name)
-
-
-def joined(clouds: Sequence[Cloud], name: str) -> Cloud:
-    """Return the points of several clouds as one, coordinates only; a single one as it is.
-
-    Raises
-    ------
-    FrameError
-        They differ in coordinate system or unit.
-    """
-    if len(clouds) == 1:
-        return replace(clouds[0], name=name)
-    first = clouds[0].frame
-    for cloud in clouds[1:]:
-        frame = cloud.frame
-        if not is_same_crs(frame.crs, first.crs) or frame.unit_m != first.unit_m:
-            msg = (
-                f"cloud {name!r}: {clouds[0].name} and {cloud.name} differ in coordinate "
-                "system or unit. Reproject one, or list them as clouds of their own."
-            )
-            raise FrameError(msg)
-    xyz = np.concatenate([cloud.rebased(first.origin).xyz for cloud in clouds])
-    records = np.zeros(len(xyz), dtype=[("file", "<u2")])
-    return Cloud(xyz=xyz, records=records, frame=first, name=name)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -125,10 +46,15 @@ class Loader:
     shown: Callable[[Path], str]
     room: Room
     inputs: dict[Path, dict[str, Any]] = field(default_factory=dict)
-    held: dict[Path, int] = field(default_factory=dict)
-    """Filtered points of each file, which wait in memory."""
+    waiting: int = 0
+    """Filtered points that wait in memory."""
     units: dict[str, float | None] = field(default_factory=dict)
     """Metres per unit of the project's clouds whose scale was searched; None: none was found."""
+
+    def hold(self) -> Hold:
+        """Return how many points may be held beside those that wait, and where the others go."""
+        most = self.room.most_tile_points(0, self.waiting) or LEAST_TILE_POINTS
+        return Hold(most, self.store.folder / "run")
 
     def movers(self, entry: Entry, scale: ScaleSearch | None = None) -> list[Mover]:
         """Return what moves as one of a project's cloud, read and filtered.
@@ -159,17 +85,16 @@ class Loader:
         self.progress.stage(f"reading {file.name}")
         with self.clock.measure("read"):
             digest = sha256(file)
-        waiting = sum(self.held.values())
         if entry.name in self.units and self.units[entry.name] is None:
             found = self._unfiltered(entry, file)
-        elif is_too_large(file, self.room, waiting):
+        elif is_too_large(file, self.room, self.waiting):
             found = self._on_tiles(entry, file, digest)
         else:
             found = self._whole(entry, file, digest)
         self.inputs[file] = {"path": self.shown(file), "sha256": digest, "points": 0}
         for source in found:
             self.inputs[file]["points"] += source.points_in
-            self.held[file] = self.held.get(file, 0) + len(source.filtered.cloud)
+            self.waiting += source.kept.points if source.kept.is_held else 0
             yield source
 
     def _placed(self, entry: Entry, cloud: Cloud) -> Cloud:
@@ -193,7 +118,8 @@ class Loader:
         nothing = np.zeros(len(cloud), dtype=np.uint8)
         filtered = Filtered(cloud=cloud, codes=nothing, ground_class=nothing, stages=())
         noticed = (*self._noticed(entry, cloud), "not filtered, since its scale is not known")
-        yield self._source(entry, file, -1, filtered, noticed, cloud.select(np.arange(0)))
+        removed = cloud.select(np.arange(0))
+        yield self._source(entry, file, -1, Kept.of(cloud), filtered, noticed, removed)
 
     def _whole(self, entry: Entry, file: Path, digest: str) -> Iterator[Source]:
         """Read the file, then filter its clouds one by one."""
@@ -207,19 +133,20 @@ class Loader:
             books = self.store.load(key)
             if books is not None and len(books.codes) == len(cloud):
                 self._say_known(cloud.name)
-                kept = cloud.select(np.flatnonzero(books.codes == Reason.KEPT))
+                kept = Kept.of(cloud.select(np.flatnonzero(books.codes == Reason.KEPT)))
                 removed = removed_sample(cloud, books.codes, details=books.details)
-                yield self._source(entry, file, station, books.on(kept), books.noticed, removed)
+                yield self._source(entry, file, station, kept, books, books.noticed, removed)
                 continue
             with self.clock.measure("filter"):
                 noticed = self._noticed(entry, cloud)
                 filtered = filter_cloud(cloud, entry.kind, self.recipe, self.progress)
             self.store.save(key, filtered, noticed)
             removed = removed_sample(cloud, filtered.codes, details=filtered.details)
-            yield self._source(entry, file, station, filtered, noticed, removed)
+            kept = Kept.of(filtered.cloud)
+            yield self._source(entry, file, station, kept, filtered, noticed, removed)
 
     def _on_tiles(self, entry: Entry, file: Path, digest: str) -> Iterator[Source]:
-        """Filter the clouds of a file that does not fit in memory, then read what is left."""
+        """Filter the clouds of a file that does not fit in memory; what is left stays on disk."""
         self.progress.note(f"{file.name} is larger than memory: it is filtered on tiles")
         job = tiled_job(steps_of(entry.kind, self.recipe))
         points = describe(file).points
@@ -228,27 +155,29 @@ class Loader:
             if self.store.load(key) is not None:
                 self._say_known(file.stem)
                 continue
+            scratch = self.store.folder / f"tiles-{self._tiles_key(entry, digest, station)}"
             with self.clock.measure("filter"):
                 books = filter_chunks(
                     (self._placed(entry, chunk) for chunk in raw),
                     job,
                     points=points,
                     room=self.room,
-                    waiting=sum(self.held.values()),
-                    scratch=self.store.folder / f"tiles-{self._tiles_key(entry, digest, station)}",
+                    waiting=self.waiting,
+                    scratch=scratch,
                     progress=self.progress,
-                    is_kept_in_memory=True,
                 )
             self.store.save(key, books, books.noticed)
+            if self.store.is_temporary:
+                forget_tiles(scratch)
         for station, raw in enumerate(stations_of(file, split=not entry.registered)):
-            known = self.store.load(self._key(entry, digest, station))
+            key = self._key(entry, digest, station)
+            known = self.store.load(key)
             assert known is not None
+            self.progress.stage(f"{file.stem}: reading what is left")
             with self.clock.measure("read"):
                 chunks = (self._placed(entry, chunk) for chunk in raw)
-                thinned, codes = undecimated(chunks, known.codes)
-            filtered = known.on(thinned.select(np.flatnonzero(codes == Reason.KEPT)))
-            removed = removed_sample(thinned, codes, details=left_of(known.details, known.codes))
-            yield self._source(entry, file, station, filtered, known.noticed, removed)
+                kept, removed = spooled(chunks, known, self.store.folder / f"kept-{key[:16]}")
+            yield self._source(entry, file, station, kept, known, known.noticed, removed)
 
     def _tiles_key(self, entry: Entry, digest: str, station: int) -> str:
         """Return the name of the tiles: a hash of what they depend on, not of later filters."""
@@ -270,15 +199,18 @@ class Loader:
         entry: Entry,
         file: Path,
         station: int,
-        filtered: Filtered,
+        kept: Kept,
+        books: Filtered | Books,
         noticed: Iterable[str],
         removed: Cloud,
     ) -> Source:
         return Source(
             file=file,
             station=-1 if entry.registered else station,
-            filtered=filtered,
-            points_in=len(filtered.codes),
+            kept=kept,
+            tally=Tally.of(books),
+            stages=books.stages,
+            points_in=len(books.codes),
             removed=removed,
-            notes=(*(f"{file.name}: {note}" for note in noticed), *filtered.notes),
+            notes=(*(f"{file.name}: {note}" for note in noticed), *books.notes),
         )

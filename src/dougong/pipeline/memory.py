@@ -17,7 +17,7 @@ BYTES_PER_WAITING_POINT = 110
 _BYTES_PER_TILE_POINT = 250
 _BYTES_PER_BOOKED_POINT = 7
 """Of a cloud on tiles, the reason, the ground class and the details of every point are held."""
-_LEAST_TILE_POINTS = 100_000
+LEAST_TILE_POINTS = 100_000
 _MOST_TILE_POINTS = 20_000_000
 """Larger tiles gain nothing."""
 _SHARE = 0.8
@@ -46,7 +46,7 @@ class Room:
         """Return how many points a tile of a cloud of `points` may have; None: no room for any."""
         left = self.bytes - tiles_bytes(points, 0, waiting)
         most = int(min(max(left, 0.0) / _BYTES_PER_TILE_POINT, _MOST_TILE_POINTS))
-        return most if most >= _LEAST_TILE_POINTS else None
+        return most if most >= LEAST_TILE_POINTS else None
 
     def tile_points(self, points: int, waiting: int) -> int:
         """Return how many points a tile of a cloud of `points` may have.
@@ -58,30 +58,13 @@ class Room:
         """
         most = self.most_tile_points(points, waiting)
         if most is None:
-            need = tiles_bytes(points, _LEAST_TILE_POINTS, waiting)
+            need = tiles_bytes(points, LEAST_TILE_POINTS, waiting)
             msg = (
                 f"{points:,} points need about {need / 1e9:.1f} GB even on tiles, more than "
                 f"{self.name()}. Raise it, or give the clouds one by one."
             )
             raise InputError(msg)
         return most
-
-    def refuse_kept(self, kept: int, waiting: int, name: str) -> None:
-        """Refuse to go on with a decimated cloud that is still too large for what was asked.
-
-        Raises
-        ------
-        InputError
-            It is.
-        """
-        if self.is_asked and not self.holds(kept, waiting):
-            need = estimated_bytes([kept, waiting])
-            msg = (
-                f"{name}: {kept:,} points are left after the voxel grid and need about "
-                f"{need / 1e9:.1f} GB, more than {self.name()}. Raise it, or thin the cloud "
-                "more with octree_voxel_grid.voxel_m."
-            )
-            raise InputError(msg)
 
     def name(self) -> str:
         """Return the room in words, for messages."""

@@ -24,16 +24,19 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from dougong.cloud import Cloud
+from dougong.cloud import Frame, Pieces
 from dougong.filters.neighbourhood import build_index, nearest
+from dougong.formats.model import Hold
 from dougong.params import Parameters
-from dougong.pipeline.zones import Zones, grid_over, zones_of
+from dougong.pipeline.sides import Tiles, cut, whole
+from dougong.pipeline.zones import Zones, ZoneSums, grid_over
 from dougong.typing import Index, Kind, Mask, Points, Values
 
 _QUIETER = 0.67
 """The noise of one source in a zone / that of the other, below which it is the better one there."""
 _LOOK_M = 0.2
 """How far from a point the other source is looked for at all."""
+_MICRON = 1e-6
 _REACH_M = (0.03, 0.12)
 _REACH_MEDIANS = 6.0
 """Reach / median distance of the clouds: four standard deviations of a normal distribution."""
@@ -61,7 +64,9 @@ class Merge(Parameters):
 class Part:
     """One cloud that may go into the merged one, in the frame of the reference."""
 
-    cloud: Cloud
+    frame: Frame
+    points: int
+    pieces: Pieces
     source_id: int
     name: str
     kind: Kind
@@ -99,31 +104,29 @@ class Merged:
         }
 
 
-def choose(parts: Sequence[Part], params: Merge) -> Merged:
+def choose(parts: Sequence[Part], params: Merge, hold: Hold | None = None) -> Merged:
     """Return which points of each part go into the merged cloud.
 
-    Deterministic; independent of the order of parts and points and of the thread count.
+    With `hold`, sets of more points than that are worked on in tiles in its folder. Deterministic;
+    independent of the order of parts and points, of the tiles and of the thread count. Tile class:
+    two-pass (zones, then their reach), halo twice the reach.
     """
-    everything = tuple(np.ones(len(part.cloud), dtype=bool) for part in parts)
+    everything = tuple(np.ones(part.points, dtype=bool) for part in parts)
     if params.mode == "all":
         return Merged(kept=everything, mode="all")
-    origin = parts[0].cloud.frame.origin
     groups: dict[Kind, list[int]] = {}
     for place, part in enumerate(parts):
-        if len(part.cloud):
+        if part.points:
             groups.setdefault(part.kind, []).append(place)
     if len(groups) < 2:
         note = "one kind of sensor only: nothing to choose between"
         return Merged(kept=everything, mode="best", note=note)
     kinds = sorted(groups)
-    sets = [
-        np.concatenate([parts[place].cloud.rebased(origin).xyz for place in groups[kind]])
-        for kind in kinds
-    ]
-    found = better_first(sets[0], sets[1], params)
+    sets = [[parts[place] for place in groups[kind]] for kind in kinds]
+    found = better_of(_tiles_of(sets[0], sets[1], hold), params)
     masks = list(everything)
     for kind, kept in zip(kinds, (found.kept_one, found.kept_other), strict=True):
-        sizes = [len(parts[place].cloud) for place in groups[kind]]
+        sizes = [parts[place].points for place in groups[kind]]
         for place, mask in zip(groups[kind], np.split(kept, np.cumsum(sizes)[:-1]), strict=True):
             masks[place] = mask
     return Merged(
@@ -133,6 +136,19 @@ def choose(parts: Sequence[Part], params: Merge) -> Merged:
         reach_m=found.reach_m,
         note=found.note,
     )
+
+
+def _tiles_of(one: Sequence[Part], other: Sequence[Part], hold: Hold | None) -> Tiles:
+    """Return the points of two sensors as tiles: one that is held, where `hold` has room for it."""
+    origin = one[0].frame.origin
+    streams = [
+        (piece.rebased(origin).xyz for part in side for piece in part.pieces())
+        for side in (one, other)
+    ]
+    if hold is None or sum(part.points for part in (*one, *other)) <= hold.points:
+        return whole(*(np.concatenate(list(stream)) for stream in streams))
+    # A third of the room is for the tile, the others for its halo.
+    return cut((streams[0], streams[1]), hold.folder / "merge", max(hold.points // 3, 1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,62 +164,73 @@ class Chosen:
 
 def better_first(one: Points, other: Points, params: Merge) -> Chosen:
     """Return which points of two sensors' sets stay; (n, 3) and (m, 3), metres, one frame."""
-    grid = grid_over([one, other], params.zone_m)
-    zones = [zones_of(one, grid), zones_of(other, grid)]
+    return better_of(whole(one, other), params)
+
+
+def better_of(tiles: Tiles, params: Merge) -> Chosen:
+    """Return which points of two sensors stay."""
+    grid = grid_over((points for sides in tiles(0.0) for points in sides.points), params.zone_m)
+    sums, kept = (ZoneSums(grid), ZoneSums(grid)), [0, 0]
+    for sides in tiles(0.0):
+        for side in (0, 1):
+            kept[side] += len(sides.rows[side])
+            if len(sides.rows[side]):
+                sums[side].add(sides.own(side))
+    zones = (sums[0].zones(), sums[1].zones())
+    masks = (np.ones(kept[0], dtype=bool), np.ones(kept[1], dtype=bool))
     noise = (zones[0].typical_noise_m, zones[1].typical_noise_m)
     if not np.isfinite(noise).all():
+        note = "a cloud has no flat zone to judge its noise by: every point was kept"
         return Chosen(
-            kept_one=np.ones(len(one), dtype=bool),
-            kept_other=np.ones(len(other), dtype=bool),
-            noise_m=noise,
-            reach_m=None,
-            note="a cloud has no flat zone to judge its noise by: every point was kept",
+            kept_one=masks[0], kept_other=masks[1], noise_m=noise, reach_m=None, note=note
         )
-    good, bad = (0, 1) if noise[0] <= noise[1] else (1, 0)
-    points = [one, other]
-    better, worse = _Side(points[good], zones[good]), _Side(points[bad], zones[bad])
-    is_reversed = _reversed_zones(better.zones, worse.zones)
-    reach = params.reach_m or _reach(better, worse, params)
+    good = 0 if noise[0] <= noise[1] else 1
+    rule = _Rule(
+        better=zones[good],
+        worse=zones[1 - good],
+        is_reversed=_reversed_zones(zones[good], zones[1 - good]),
+        params=params,
+    )
+    reach = params.reach_m or _reach(tiles, good, rule)
+    for sides in tiles(2.0 * reach):
+        lost = _lost(sides.points[good], sides.points[1 - good], reach, rule)
+        for side, is_lost in ((good, lost[0]), (1 - good, lost[1])):
+            own = sides.rows[side]
+            masks[side][own] = ~is_lost[: len(own)]
+    return Chosen(kept_one=masks[0], kept_other=masks[1], noise_m=noise, reach_m=reach)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Rule:
+    """What is known of both whole sets before any point is judged."""
+
+    better: Zones
+    worse: Zones
+    is_reversed: Index
+    """Keys of zones in which the noisier cloud is clearly the quieter one."""
+    params: Merge
+
+
+def _lost(better: Points, worse: Points, reach: float, rule: _Rule) -> tuple[Mask, Mask]:
+    """Return which points of either set a better source stands in for.
+
+    What a point of the worse set rests on lies within the reach, and what that rests on within as
+    much again: twice the reach is the halo.
+    """
     # Where the worse cloud is the better one, its points stay and stand in for the other's.
-    stands_in = worse.in_zones(is_reversed)
-    lost_better = np.zeros(len(better.points), dtype=bool)
+    stands_in = rule.worse.are_in(worse, rule.is_reversed)
+    lost_better = np.zeros(len(better), dtype=bool)
     if stands_in.any():
-        candidates = np.flatnonzero(better.in_zones(is_reversed))
+        candidates = np.flatnonzero(rule.better.are_in(better, rule.is_reversed))
         lost_better[candidates] = _covered(
-            better.points[candidates], better.zones, worse.only(stands_in), reach, params
+            better[candidates], rule.better, worse[stands_in], rule.worse, reach, rule.params
         )
     candidates = np.flatnonzero(~stands_in)
-    lost_worse = np.zeros(len(worse.points), dtype=bool)
+    lost_worse = np.zeros(len(worse), dtype=bool)
     lost_worse[candidates] = _covered(
-        worse.points[candidates], worse.zones, better.only(~lost_better), reach, params
+        worse[candidates], rule.worse, better[~lost_better], rule.better, reach, rule.params
     )
-    kept = [~lost_better, ~lost_worse]
-    return Chosen(
-        kept_one=kept[0] if good == 0 else kept[1],
-        kept_other=kept[1] if good == 0 else kept[0],
-        noise_m=noise,
-        reach_m=reach,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class _Side:
-    """The points of one source and their zones."""
-
-    points: Points
-    zones: Zones
-    place: Index | None = None
-    """(n,) zone of each point, where the points are some of those that made the zones."""
-
-    def of(self) -> Index:
-        return self.zones.place if self.place is None else self.place
-
-    def only(self, chosen: Mask) -> _Side:
-        return _Side(self.points[chosen], self.zones, self.of()[chosen])
-
-    def in_zones(self, keys: Index) -> Mask:
-        """Return which points lie in zones of these sorted keys."""
-        return np.isin(self.zones.keys[self.of()], keys)
+    return lost_better, lost_worse
 
 
 def _reversed_zones(better: Zones, worse: Zones) -> Index:
@@ -214,20 +241,34 @@ def _reversed_zones(better: Zones, worse: Zones) -> Index:
     return better.keys[is_there & is_quieter]
 
 
-def _reach(better: _Side, worse: _Side, params: Merge) -> float:
+def _reach(tiles: Tiles, good: int, rule: _Rule) -> float:
     """Return how far across the surface the two clouds lie from each other, with noise."""
-    dense = _is_dense(worse.points, worse.zones, better.zones, params)
-    asked = worse.points[dense]
-    place, distance = nearest(build_index(better.points), asked, _LOOK_M)
-    hit = np.flatnonzero(place >= 0)
-    zone = better.of()[place[hit]]
-    gap = asked[hit] - better.points[place[hit]]
-    is_over = _is_over(gap, distance[hit], better.zones, zone)
-    is_flat = is_over & np.isfinite(better.zones.noise_m[zone])
-    across = np.abs(np.einsum("ij,ij->i", gap, better.zones.normals[zone]))[is_flat]
-    if not len(across):
+    # Whole micrometres are counted: exact whatever the tiles, and nothing is held.
+    counts = np.zeros(int(_LOOK_M / _MICRON) + 2, np.int64)
+    for sides in tiles(_LOOK_M):
+        across = _across(sides.points[good], sides.own(1 - good), rule)
+        counts += np.bincount(np.rint(across / _MICRON).astype(np.int64), minlength=len(counts))
+    if not counts.any():
         return _REACH_M[0]
-    return float(np.clip(_REACH_MEDIANS * np.median(across), *_REACH_M))
+    before = np.cumsum(counts)
+    last = int(before[-1])
+    middle = np.searchsorted(before, [(last - 1) // 2, last // 2], side="right").mean() * _MICRON
+    return float(np.clip(_REACH_MEDIANS * middle, *_REACH_M))
+
+
+def _across(better: Points, worse: Points, rule: _Rule) -> Values:
+    """Return the distances across the surface of the worse points where both are dense."""
+    if not len(better) or not len(worse):
+        return np.empty(0)
+    asked = worse[_is_dense(worse, rule.worse, rule.better, rule.params)]
+    place, distance = nearest(build_index(better), asked, _LOOK_M)
+    hit = np.flatnonzero(place >= 0)
+    zone = rule.better.of(better[place[hit]])
+    gap = asked[hit] - better[place[hit]]
+    is_over = _is_over(gap, distance[hit], rule.better, zone)
+    is_flat = is_over & np.isfinite(rule.better.noise_m[zone])
+    across: Values = np.abs(np.einsum("ij,ij->i", gap, rule.better.normals[zone]))[is_flat]
+    return across
 
 
 def _is_dense(points: Points, own: Zones, other: Zones, params: Merge) -> Mask:
@@ -237,17 +278,19 @@ def _is_dense(points: Points, own: Zones, other: Zones, params: Merge) -> Mask:
     return is_dense[place]
 
 
-def _covered(points: Points, own: Zones, by: _Side, reach: float, params: Merge) -> Mask:
-    """Return which `points` the source `by` can stand in for; `own`: the zones they are from."""
+def _covered(
+    points: Points, own: Zones, by: Points, zones: Zones, reach: float, params: Merge
+) -> Mask:
+    """Return which `points` the points `by`, of `zones`, stand in for; `own`: their own zones."""
     is_covered = np.zeros(len(points), dtype=bool)
-    if not len(points) or not len(by.points):
+    if not len(points) or not len(by):
         return is_covered
-    dense = np.flatnonzero(_is_dense(points, own, by.zones, params))
-    place, distance = nearest(build_index(by.points), points[dense], reach)
+    dense = np.flatnonzero(_is_dense(points, own, zones, params))
+    place, distance = nearest(build_index(by), points[dense], reach)
     hit = np.flatnonzero(place >= 0)
-    zone = by.of()[place[hit]]
-    gap = points[dense[hit]] - by.points[place[hit]]
-    is_covered[dense[hit]] = _is_over(gap, distance[hit], by.zones, zone)
+    zone = zones.of(by[place[hit]])
+    gap = points[dense[hit]] - by[place[hit]]
+    is_covered[dense[hit]] = _is_over(gap, distance[hit], zones, zone)
     return is_covered
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from dougong.cloud import Cloud, Frame
 from dougong.pipeline.links import Linked, register_pair
-from dougong.pipeline.loading import Mover
+from dougong.pipeline.movers import Mover, ReducedClouds
 from dougong.pipeline.progress import Progress
 from dougong.registration import Register
 from dougong.registration.control_solve import ControlPoints
@@ -29,7 +29,7 @@ from dougong.registration.result import Hypothesis, Registration
 from dougong.typing import Transform
 
 _TRIES = 4
-"""So many clouds are tried in a round, before a cloud waits for others to be placed."""
+"""Clouds that are tried in a round, before a cloud waits for others to be placed."""
 _MOST_TRIES = 12
 _LEAST_OVERLAP = 0.2
 """Share of the smaller cloud's cells that the other one has too, for a pair worth checking."""
@@ -68,14 +68,12 @@ class _Search:
     params: Register
     control: Mapping[str, ControlPoints]
     progress: Progress
-    clouds: dict[str, Cloud] = field(default_factory=dict)
+    clouds: ReducedClouds
     tried: dict[tuple[str, str], Registration] = field(default_factory=dict)
 
     def cloud(self, name: str) -> Cloud:
-        """Return the joined cloud of a mover."""
-        if name not in self.clouds:
-            self.clouds[name] = self.movers[name].joined()
-        return self.clouds[name]
+        """Return the reduced cloud of a mover."""
+        return self.clouds.of(name).cloud
 
     def registered(self, source: str, target: str) -> Registration:
         """Register a pair, once."""
@@ -111,18 +109,19 @@ def register_all(
     params: Register,
     control: Mapping[str, ControlPoints],
     progress: Progress,
+    clouds: ReducedClouds,
 ) -> Frames:
     """Bring every mover into the frame of the reference.
 
     Parameters
     ----------
     movers : sequence of Mover
-        All of a project, `reference` among them.
-    reference : Mover
+    reference : Mover, one of them
     params : Register
     control : mapping of str to ControlPoints
         By cloud, see `pipeline.control`.
     progress : Progress
+    clouds : ReducedClouds, of `movers`
     """
     search = _Search(
         movers={mover.name: mover for mover in movers},
@@ -130,6 +129,7 @@ def register_all(
         params=params.model_copy(update={"filtered": True}),
         control=control,
         progress=progress,
+        clouds=clouds,
     )
     parents = _reach(search)
     joined = None

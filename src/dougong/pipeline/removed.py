@@ -1,7 +1,6 @@
 """A sample of what the filters took out, to be looked at: where, and why."""
 
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from dougong.cloud import Cloud
 from dougong.filters.protective import Taken
 from dougong.filters.selection import DETAIL, Reason
 from dougong.formats.faults import coordinate_hashes
-from dougong.pipeline.steps import Filtered
+from dougong.typing import Index, Points
 
 MOST = 100_000
 """Removed points of one file (or station) that are kept for looking."""
@@ -33,15 +32,6 @@ def detail_counts(
         for taken in Taken
         if taken != Taken.KEPT
     }
-
-
-def detail_totals(parts: Iterable[Filtered]) -> dict[str, int]:
-    """Return how many points of all parts each detailed reason took."""
-    counts: Counter[str] = Counter()
-    for part in parts:
-        found = detail_counts(part.codes, part.details)
-        counts.update({name: row["points"] for name, row in found.items()})
-    return dict(counts)
 
 
 def removed_sample(
@@ -67,9 +57,18 @@ def removed_sample(
     """
     chosen = np.flatnonzero((codes != Reason.KEPT) & (codes != Reason.DECIMATED))
     if len(chosen) > most:
-        hashes = coordinate_hashes(cloud.xyz[chosen])
-        chosen = np.sort(chosen[np.argsort(hashes, kind="stable")[:most]])
+        chosen = chosen[_smallest(cloud.xyz[chosen], most)]
     sample = cloud.select(chosen).with_attribute("dougong_reason", codes[chosen])
     for name, values in (details or {}).items():
         sample = sample.with_attribute(name, values[chosen])
     return sample
+
+
+def shortened(sample: Cloud, most: int = MOST) -> Cloud:
+    """Return the sample of two samples, together in the order of the file."""
+    return sample if len(sample) <= most else sample.select(_smallest(sample.xyz, most))
+
+
+def _smallest(xyz: Points, most: int) -> Index:
+    """Return the places, ascending, of the `most` points with the smallest hashes."""
+    return np.sort(np.argsort(coordinate_hashes(xyz), kind="stable")[:most])

@@ -16,19 +16,20 @@ from dougong.pipeline.full_resolution import Place, full_notes, write_full_resol
 from dougong.pipeline.links import Linked, measured_link
 from dougong.pipeline.loading import Loader
 from dougong.pipeline.memory import Room
+from dougong.pipeline.movers import ReducedClouds
 from dougong.pipeline.network import register_all
 from dougong.pipeline.outputs import write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Project
 from dougong.pipeline.provenance import Clock, peak_memory_bytes, software
 from dougong.pipeline.registrations import finite
+from dougong.pipeline.result_hash import result_hash
 from dougong.pipeline.run_document import (
     DISTANCES,
     cloud_document,
     notes_of,
     project_document,
     registration_documents,
-    result_hash,
 )
 from dougong.pipeline.scaling import load_all
 from dougong.pipeline.store import Store
@@ -61,7 +62,7 @@ def run(
         Keeps finished filter steps.
     progress : Progress
     room : Room, optional
-        Memory that may be used; a laser scan that does not fit is decimated on tiles.
+        Memory that may be used; what does not fit is worked on in tiles on disk.
     shown : callable
         How a path is named in the results.
 
@@ -83,30 +84,35 @@ def run(
     control = control_of_project(project, folder)
     movers = load_all(project, loader, control)
     reference = next(mover for mover in movers if mover.entry == project.reference())
+    clouds = ReducedClouds(movers)
     with clock.measure("register"):
-        found = register_all(movers, reference, project.registration, control, progress)
+        found = register_all(movers, reference, project.registration, control, progress, clouds)
         linked = found.linked
     with clock.measure("distances"):
-        linked = [measured_link(link, reference, progress) for link in linked]
+        linked = [measured_link(link, reference, clouds, progress) for link in linked]
+    clouds.forget()
+    hold = loader.hold()
     documents = registration_documents(linked, reference, loader)
     for link in linked:
         if link.measured is not None:
             write_distances(link.measured, out / DISTANCES / f"{link.mover.name}.laz")
     with clock.measure("write"):
-        merged = write_clouds(linked, reference, project.merge, out, progress)
+        merged = write_clouds(linked, reference.frame, project.merge, out, progress, hold)
     write_registrations(documents, linked, reference, out, shown)
     full = None
     if project.project.full_resolution:
         with clock.measure("full_resolution"):
             full = write_full_resolution(
                 _places(linked),
-                reference.clouds[0].frame,
+                reference.frame,
                 out,
                 reference=reference.name,
                 inputs=loader.inputs,
                 shown=shown,
                 progress=progress,
             )
+    with clock.measure("hash"):
+        digest = result_hash(linked, reference.frame, hold)
     statuses = [document["status"] for document in documents] or ["ok"]
     quality = quality_document(project.quality.required_level, documents)
     result: dict[str, Any] = {
@@ -123,7 +129,7 @@ def run(
         "seconds": {**clock.seconds, "total": clock.total()},
         "peak_memory_bytes": peak_memory_bytes(),
         "finished_utc": datetime.now(UTC).isoformat(timespec="seconds"),
-        "result_hash": result_hash(linked, reference),
+        "result_hash": digest,
         "software": software(),
         "parameters": project_document(project, shown),
         "inputs": list(loader.inputs.values()),
@@ -142,7 +148,7 @@ def _places(linked: Sequence[Linked]) -> list[Place]:
             entry=link.mover.entry,
             file=source.file,
             # Scans without points are not among the stations; the header counts them.
-            station=source.filtered.cloud.header.station if source.is_scan else -1,
+            station=source.kept.first.header.station if source.is_scan else -1,
             status="reference" if link.result is None else link.result.status,
             matrix=link.matrix,
         )

@@ -1,22 +1,18 @@
 """What result.json says of a run: its clouds, registrations and parameters, as plain data."""
 
-import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from dougong.filters.selection import Reason
 from dougong.pipeline.distances import (
     distances_document,
 )
 from dougong.pipeline.links import Linked
-from dougong.pipeline.loading import Loader, Mover
+from dougong.pipeline.loading import Loader
+from dougong.pipeline.movers import Mover
 from dougong.pipeline.project import Project
 from dougong.pipeline.registrations import to_document
-from dougong.pipeline.removed import detail_totals
 
 DISTANCES = "distances"
 
@@ -30,7 +26,7 @@ def registration_documents(
             link.result,
             source=link.mover.name,
             target=reference.name,
-            target_frame=reference.clouds[0].frame,
+            target_frame=reference.frame,
             inputs=[
                 loader.inputs[source.file] for source in (*link.mover.sources, *reference.sources)
             ],
@@ -50,6 +46,11 @@ def _distances_document(link: Linked) -> dict[str, Any] | None:
 def cloud_document(link: Linked, loader: Loader) -> dict[str, Any]:
     """Return the counts of one cloud, stage by stage."""
     mover = link.mover
+    reasons: Counter[str] = Counter()
+    details: Counter[str] = Counter()
+    for source in mover.sources:
+        reasons.update(source.tally.reasons)
+        details.update(source.tally.details)
     return {
         "name": mover.name,
         "kind": mover.kind,
@@ -60,10 +61,10 @@ def cloud_document(link: Linked, loader: Loader) -> dict[str, Any]:
         "points_out": mover.points_out,
         "reduction": 1.0 - mover.points_out / mover.points_in,
         "stages": stage_documents(mover),
-        "reasons": reason_counts([source.filtered.codes for source in mover.sources]),
-        "removal_details": detail_totals(source.filtered for source in mover.sources),
+        "reasons": {name: count for name, count in reasons.items() if count},
+        "removal_details": dict(details),
         "removed_shown": sum(len(source.removed) for source in mover.sources),
-        "ground_points": int(sum(source.filtered.is_ground.sum() for source in mover.sources)),
+        "ground_points": sum(source.tally.ground for source in mover.sources),
     }
 
 
@@ -71,7 +72,7 @@ def stage_documents(mover: Mover) -> list[dict[str, Any]]:
     """Return the stages of a mover, summed over its files."""
     rows: dict[str, dict[str, Any]] = {}
     for source in mover.sources:
-        for stage in source.filtered.stages:
+        for stage in source.stages:
             row = rows.setdefault(
                 stage.name, {"name": stage.name, "points_in": 0, "points_out": 0, "seconds": 0.0}
             )
@@ -83,36 +84,12 @@ def stage_documents(mover: Mover) -> list[dict[str, Any]]:
     return list(rows.values())
 
 
-def reason_counts(codes: Sequence[np.typing.NDArray[np.uint8]]) -> dict[str, int]:
-    """Return how many points each reason took (and how many were kept)."""
-    counts: Counter[int] = Counter()
-    for array in codes:
-        counts.update(dict(enumerate(np.bincount(array, minlength=len(Reason)).tolist())))
-    return {reason.name.lower(): counts[reason] for reason in Reason if counts[reason]}
-
-
 def project_document(project: Project, shown: Callable[[Path], str]) -> dict[str, Any]:
     """Return the project as data, its files named as everywhere in the results."""
     document: dict[str, Any] = project.model_dump(mode="json", by_alias=True)
     for entry in document["cloud"]:
         entry["files"] = [shown(Path(file)) for file in entry["files"]]
     return document
-
-
-def result_hash(linked: Sequence[Linked], reference: Mover) -> str:
-    """Return the SHA-256 of kept records and local matrices: no time, path or header in it."""
-    digest = hashlib.sha256()
-    target = reference.joined().frame
-    for link in linked:
-        for cloud in link.mover.clouds:
-            records = np.ascontiguousarray(cloud.records)
-            digest.update(np.sort(records.view(f"V{records.dtype.itemsize}")).tobytes())
-        if link.result is not None and link.result.matrix is not None:
-            to_file = link.mover.joined().frame.T_file_local()
-            local = np.linalg.inv(target.T_file_local()) @ link.result.matrix @ to_file
-            # Adding zero turns -0.0 into 0.0, which has other bytes.
-            digest.update((np.round(local, 9) + 0.0).tobytes())
-    return digest.hexdigest()
 
 
 def notes_of(linked: Sequence[Linked]) -> list[str]:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -119,7 +119,6 @@ def filter_chunks(
     waiting: int,
     scratch: Path,
     progress: Progress,
-    is_kept_in_memory: bool = False,
 ) -> Books:
     """Filter a cloud that comes in `chunks` without ever holding it; return the books of it.
 
@@ -137,13 +136,11 @@ def filter_chunks(
         Gets the cloud, once as decoded and once in tiles. Tiles that an earlier run left there
         are gone on with.
     progress : Progress
-    is_kept_in_memory : bool
-        What is left will be held: refuse early what does not fit.
 
     Raises
     ------
     InputError
-        Even tiles do not fit, what the voxel grid leaves does not, or no point is left.
+        Even tiles do not fit, or no point is left.
     FormatError, OutputError, TileError
         The file cannot be read, `scratch` cannot be written (a full disk), a tile failed.
     """
@@ -155,8 +152,6 @@ def filter_chunks(
             kept = max(most // (_HALO_SHARE * engine.width), 1)
             tiles = _cut(chunks, job, most, kept, scratch, progress)
         name = tiles.facts["name"]
-        if is_kept_in_memory:
-            room.refuse_kept(tiles.points, waiting, name)
         stages = [_grid_stage(tiles, time.perf_counter() - start)] if job.grid is not None else []
         bench = TileBench(tiles, engine)
         notes = _run_steps(bench, job, stages, progress)
@@ -252,41 +247,3 @@ def _books(
 def forget_tiles(folder: Path) -> None:
     """Delete the tiles in `folder`."""
     shutil.rmtree(folder, ignore_errors=True)
-
-
-def undecimated(
-    chunks: Iterator[Cloud], codes: NDArray[np.uint8]
-) -> tuple[Cloud, NDArray[np.uint8]]:
-    """Return the points of `chunks` that the voxel grid left, and their codes, of all codes (n,).
-
-    Raises
-    ------
-    InputError
-        The codes are of another cloud.
-    """
-    parts, done = [], 0
-    for chunk in chunks:
-        is_left = codes[done : done + len(chunk)] != Reason.DECIMATED
-        done += len(chunk)
-        if done <= len(codes):
-            parts.append(chunk.select(is_left))
-    if done != len(codes):
-        msg = (
-            f"the finished step that --work keeps is of {len(codes):,} points, the cloud has "
-            f"{done:,}. Delete the --work folder."
-        )
-        raise InputError(msg)
-    cloud = replace(
-        parts[0],
-        xyz=np.concatenate([part.xyz for part in parts]),
-        records=np.concatenate([part.records for part in parts]),
-    )
-    return cloud, codes[codes != Reason.DECIMATED]
-
-
-def left_of(
-    details: Mapping[str, NDArray[Any]], codes: NDArray[np.uint8]
-) -> dict[str, NDArray[Any]]:
-    """Return `details` (n,) of the points that the voxel grid left, by all codes (n,)."""
-    is_left = codes != Reason.DECIMATED
-    return {name: values[is_left] for name, values in details.items()}

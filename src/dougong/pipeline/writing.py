@@ -1,61 +1,80 @@
 """What a run writes beside its result.json: clouds, the merged one, registrations."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from dougong.cloud import Cloud
+from dougong.cloud import Cloud, Frame, Pieces, in_pieces
 from dougong.formats import write, write_merged
-from dougong.pipeline.distances import (
-    with_distances,
-)
+from dougong.formats.model import Hold
+from dougong.pipeline.distances import Painter
 from dougong.pipeline.exports import Ends, write_registration
 from dougong.pipeline.links import Linked
-from dougong.pipeline.loading import Mover
 from dougong.pipeline.merging import Merge, Part, choose
+from dougong.pipeline.movers import Mover
 from dougong.pipeline.progress import Progress
+from dougong.typing import Mask
 
 MERGED = "merged.copc.laz"
 REMOVED = "removed"
 
 
 def write_clouds(
-    linked: Sequence[Linked], reference: Mover, merge: Merge, out: Path, progress: Progress
+    linked: Sequence[Linked],
+    reference: Frame,
+    merge: Merge,
+    out: Path,
+    progress: Progress,
+    hold: Hold,
 ) -> dict[str, Any]:
     """Write each filtered cloud and the merged one; return what the merged one holds."""
-    frame_of = reference.clouds[0]
     parts: list[Part] = []
+    painted: list[Pieces] = []
     measured = [link.measured for link in linked if link.measured is not None]
     for source_id, link in enumerate(linked, 1):
         progress.stage(f"writing clouds/{link.mover.name}.laz")
-        clouds = link.in_reference(link.mover.clouds, frame_of)
-        _write_one(clouds, out / "clouds" / f"{link.mover.name}.laz", source_id)
+        kept = [source.kept for source in link.mover.sources]
+        clouds = [link.placed_pieces(one, reference) for one in kept]
+        _write_one(clouds, out / "clouds" / f"{link.mover.name}.laz", source_id, hold)
         removed = [source.removed for source in link.mover.sources if len(source.removed)]
         if removed:
-            placed = link.in_reference(removed, frame_of)
-            _write_one(placed, out / REMOVED / f"{link.mover.name}.laz", source_id)
-        if link.is_sure:
-            if measured:
-                own = measured if link.result is None else [link.measured] if link.measured else []
-                clouds = [with_distances(cloud, own) for cloud in clouds]
-            parts += [
-                Part(cloud=c, source_id=source_id, name=link.mover.name, kind=link.mover.kind)
-                for c in clouds
-            ]
+            placed = [in_pieces(link.placed(cloud, reference)) for cloud in removed]
+            _write_one(placed, out / REMOVED / f"{link.mover.name}.laz", source_id, hold)
+        if not link.is_sure:
+            continue
+        own = measured if link.result is None else [link.measured] if link.measured else []
+        paint = Painter(own) if measured else None
+        for one, pieces in zip(kept, clouds, strict=True):
+            parts.append(
+                Part(
+                    frame=link.placed(one.first, reference).frame,
+                    points=one.points,
+                    pieces=pieces,
+                    source_id=source_id,
+                    name=link.mover.name,
+                    kind=link.mover.kind,
+                )
+            )
+            painted.append(pieces if paint is None else paint.pieces(pieces))
     progress.stage(f"writing {MERGED}")
-    return {"file": MERGED, **_write_merged(parts, merge, out / MERGED, progress)}
+    return {"file": MERGED, **_write_merged(parts, painted, merge, out / MERGED, progress, hold)}
 
 
 def _write_merged(
-    parts: Sequence[Part], merge: Merge, path: Path, progress: Progress
+    parts: Sequence[Part],
+    painted: Sequence[Pieces],
+    merge: Merge,
+    path: Path,
+    progress: Progress,
+    hold: Hold,
 ) -> dict[str, Any]:
     """Write what is chosen of the sure clouds as one; return what it holds and what it does not."""
-    chosen = choose(parts, merge)
-    pairs = zip(parts, chosen.kept, strict=True)
+    chosen = choose(parts, merge, hold)
     write_merged(
-        [part.cloud if kept.all() else part.cloud.select(kept) for part, kept in pairs],
+        [_chosen(pieces, kept) for pieces, kept in zip(painted, chosen.kept, strict=True)],
         path,
         source_ids=[part.source_id for part in parts],
+        hold=hold,
     )
     document = chosen.document(parts)
     for name, row in document["sources"].items():
@@ -68,12 +87,25 @@ def _write_merged(
     return {**document, "clouds": list(ids), "source_ids": ids}
 
 
-def _write_one(clouds: Sequence[Cloud], path: Path, source_id: int) -> None:
+def _chosen(pieces: Pieces, kept: Mask) -> Pieces:
+    """Return the pieces of a cloud without the points that are not `kept`."""
+
+    def left() -> Iterator[Cloud]:
+        done = 0
+        for piece in pieces():
+            here = kept[done : done + len(piece)]
+            done += len(piece)
+            yield piece if here.all() else piece.select(here)
+
+    return left
+
+
+def _write_one(clouds: Sequence[Pieces], path: Path, source_id: int, hold: Hold) -> None:
     path.parent.mkdir(exist_ok=True)
     if len(clouds) == 1:
-        write(clouds[0], path)
+        write(clouds[0], path, hold=hold)
     else:
-        write_merged(clouds, path, source_ids=[source_id] * len(clouds))
+        write_merged(clouds, path, source_ids=[source_id] * len(clouds), hold=hold)
 
 
 def write_registrations(
@@ -89,8 +121,8 @@ def write_registrations(
         ends = Ends(
             source=mover.name,
             target=reference.name,
-            source_frame=mover.clouds[0].frame,
-            target_frame=reference.clouds[0].frame,
+            source_frame=mover.frame,
+            target_frame=reference.frame,
             # One scan of a file cannot be named in a pipeline that reads whole files.
             files=[shown(source.file) for source in mover.sources if not source.is_scan],
         )

@@ -7,6 +7,7 @@ points or the thread count.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from dougong.typing import Index, Mask, Points, Values
 
 _LATTICE_M = 1e-4
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _FEWEST = 12
 """Points of a zone that are enough to fit a plane and judge what is left."""
 _FLAT = 0.1
@@ -46,11 +48,13 @@ class Grid:
         return np.array([self.size[1] * self.size[2], self.size[2], 1], dtype=np.int64)
 
 
-def grid_over(sets: list[Points], edge_m: float) -> Grid:
+def grid_over(sets: Iterable[Points], edge_m: float) -> Grid:
     """Return the zones over all of `sets` of points, anchored at their common low corner."""
-    filled = [points for points in sets if len(points)]
-    low = np.min([points.min(axis=0) for points in filled], axis=0)
-    high = np.max([points.max(axis=0) for points in filled], axis=0)
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for points in sets:
+        if len(points):
+            low = np.minimum(low, points.min(axis=0))
+            high = np.maximum(high, points.max(axis=0))
     size = np.floor((high - low) / edge_m).astype(np.int64) + 3
     return Grid(low=low - edge_m, size=size, edge_m=edge_m)
 
@@ -66,8 +70,6 @@ class Zones:
     """(m,) standard deviation across the fitted plane; NaN where the zone is not flat."""
     normals: Points
     """(m, 3) unit normal of the plane; zero where the zone is not flat."""
-    place: Index
-    """(n,) which of the zones each point is in."""
 
     @property
     def typical_noise_m(self) -> float:
@@ -84,6 +86,15 @@ class Zones:
             total += np.where(is_there, self.counts[at], 0)
         return total
 
+    def of(self, points: Points) -> Index:
+        """Return which of the zones each of `points` (n, 3) is in; these made them."""
+        place: Index = np.searchsorted(self.keys, self.grid.keys(self.grid.cells(points)))
+        return place
+
+    def are_in(self, points: Points, keys: Index) -> Mask:
+        """Return which of `points` (n, 3) lie in zones of these keys."""
+        return np.isin(self.grid.keys(self.grid.cells(points)), keys)
+
     def find(self, keys: Index) -> tuple[Index, Mask]:
         """Return the place of each key among the zones, and whether it is there at all."""
         at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
@@ -93,28 +104,60 @@ class Zones:
 
 def zones_of(points: Points, grid: Grid) -> Zones:
     """Return the zones of `points` (n, 3), metres, n > 0."""
-    cells = grid.cells(points)
-    keys, place, counts = np.unique(grid.keys(cells), return_inverse=True, return_counts=True)
-    corner = grid.low + cells * grid.edge_m
-    lattice = np.rint((points - corner) / _LATTICE_M)
-    count = len(keys)
-    # Whole numbers far below 2**53: every sum is exact, whatever its order.
-    first = np.stack([np.bincount(place, lattice[:, k], count) for k in range(3)], axis=1)
-    pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-    second = np.stack(
-        [np.bincount(place, lattice[:, a] * lattice[:, b], count) for a, b in pairs], axis=1
-    )
-    mean = first / counts[:, None]
-    spread = second - counts[:, None] * np.stack([mean[:, a] * mean[:, b] for a, b in pairs], 1)
-    noise = np.full(count, np.nan)
-    normals = np.zeros((count, 3))
-    enough = np.flatnonzero(counts >= _FEWEST)
-    values, vectors = np.linalg.eigh(
-        spread[enough][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-    )
-    is_flat = values[:, 0] <= _FLAT * values[:, 1]
-    flat = enough[is_flat]
-    left = np.clip(values[is_flat, 0], 0.0, None) / (counts[flat] - 3)
-    noise[flat] = np.sqrt(left) * _LATTICE_M
-    normals[flat] = vectors[is_flat][:, :, 0]
-    return Zones(grid=grid, keys=keys, counts=counts, noise_m=noise, normals=normals, place=place)
+    sums = ZoneSums(grid)
+    sums.add(points)
+    return sums.zones()
+
+
+class ZoneSums:
+    """What zones are made from, as points come: 88 bytes per occupied zone."""
+
+    def __init__(self, grid: Grid) -> None:
+        self.grid = grid
+        self._keys = np.empty(0, np.int64)
+        # Count, first and second moments of the lattice coordinates about the zone's corner.
+        self._sums = np.empty((0, 10))
+
+    def add(self, points: Points) -> None:
+        """Count `points` (n, 3), metres, in."""
+        cells = self.grid.cells(points)
+        keys, place, counts = np.unique(
+            self.grid.keys(cells), return_inverse=True, return_counts=True
+        )
+        lattice = np.rint((points - (self.grid.low + cells * self.grid.edge_m)) / _LATTICE_M)
+        count = len(keys)
+        # Whole numbers far below 2**53: every sum is exact, whatever its order.
+        first = [np.bincount(place, lattice[:, k], count) for k in range(3)]
+        second = [np.bincount(place, lattice[:, a] * lattice[:, b], count) for a, b in _PAIRS]
+        new = np.stack([counts.astype(np.float64), *first, *second], axis=1)
+        both = np.union1d(self._keys, keys)
+        sums = np.zeros((len(both), 10))
+        sums[np.searchsorted(both, self._keys)] = self._sums
+        sums[np.searchsorted(both, keys)] += new
+        self._keys, self._sums = both, sums
+
+    def zones(self) -> Zones:
+        """Return the zones of all points that came."""
+        counts, first, second = self._sums[:, 0], self._sums[:, 1:4], self._sums[:, 4:]
+        mean = first / counts[:, None]
+        spread = second - counts[:, None] * np.stack(
+            [mean[:, a] * mean[:, b] for a, b in _PAIRS], 1
+        )
+        noise = np.full(len(counts), np.nan)
+        normals = np.zeros((len(counts), 3))
+        enough = np.flatnonzero(counts >= _FEWEST)
+        values, vectors = np.linalg.eigh(
+            spread[enough][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        )
+        is_flat = values[:, 0] <= _FLAT * values[:, 1]
+        flat = enough[is_flat]
+        left = np.clip(values[is_flat, 0], 0.0, None) / (counts[flat] - 3)
+        noise[flat] = np.sqrt(left) * _LATTICE_M
+        normals[flat] = vectors[is_flat][:, :, 0]
+        return Zones(
+            grid=self.grid,
+            keys=self._keys,
+            counts=counts.astype(np.int64),
+            noise_m=noise,
+            normals=normals,
+        )

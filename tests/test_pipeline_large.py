@@ -1,0 +1,151 @@
+"""A run whose clouds do not fit in memory: the same files as one whose clouds do."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dougong
+from dougong.cli import call
+from dougong.cloud import Cloud
+from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid, root_cube
+from dougong.formats.model import Hold
+from dougong.pipeline import memory, reduced
+from dougong.pipeline.result_hash import in_byte_order
+from dougong.registration.result import Registration
+from dougong.threads import get_threads, set_threads
+
+SHIFT = np.array([3.0, -2.0, 0.5])
+ROOMS = {"whole": "4GB", "few": "500kB", "many": "190kB"}
+
+
+def site(seed, offset, noise):
+    """A yard of 20 m with three walls and something flying over it."""
+    rng = np.random.default_rng(seed)
+    yard = np.column_stack([rng.uniform(0, 20, (9000, 2)), rng.normal(0, noise, 9000)])
+    walls = [
+        rng.uniform((x, y, 0), (x + 6, y, 4), (2000, 3)) + rng.normal(0, noise, (2000, 3))
+        for x, y in ((2, 4), (9, 9), (12, 15))
+    ]
+    birds = rng.uniform(3, 20, (60, 3))
+    return np.round(np.vstack([yard, *walls, birds]) + offset, 4)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Two clouds, a registration that knows, and rooms that are small on purpose."""
+
+    def register(source, target, params, **_):
+        matrix = np.eye(4)
+        matrix[:3, 3] = SHIFT
+        return Registration(
+            status="ok", matrix=matrix, reason=f"{len(source)} onto {len(target)}", probability=0.9,
+            scale=1.0, dof=6, coarse_method="plan", hypotheses=(), margin=0.5, fine=None,
+        )  # fmt: skip
+
+    monkeypatch.setattr("dougong.pipeline.links.register", register)
+    monkeypatch.setattr("dougong.app._build_report", lambda *_: None)
+    for name, value in (("BASE_BYTES", 0), ("BYTES_PER_POINT", 30), ("LEAST_TILE_POINTS", 100),
+                        ("BYTES_PER_WAITING_POINT", 10), ("_BYTES_PER_BOOKED_POINT", 1),
+                        ("_BYTES_PER_TILE_POINT", 40)):  # fmt: skip
+        monkeypatch.setattr(memory, name, value)
+    monkeypatch.setattr(reduced, "MOST_POINTS", 6000)
+    monkeypatch.setattr(reduced, "LEAST_POINTS", 6000)
+    monkeypatch.setattr(reduced, "_BATCH", 2000)
+    monkeypatch.setattr("dougong.pipeline.tiled.CHUNK_POINTS", 2000)
+    write(tmp_path)
+    return tmp_path
+
+
+def write(folder, order=None):
+    for name, points in (("scan", site(0, 0.0, 0.002)), ("map", site(1, SHIFT, 0.01))):
+        turn = np.arange(len(points)) if order is None else order.permutation(len(points))
+        dougong.write(Cloud.from_points(points[turn]), folder / f"{name}.laz", overwrite=True)
+
+
+def run(folder, name, room, *options):
+    out = folder / name
+    tokens = ["--lidar", folder / "scan.laz", "--photogrammetry", folder / "map.laz", "--quiet"]
+    tokens += ["--out", out, "--memory", room, *options]
+    assert call(["run", *map(str, tokens)]) == 0
+    return json.loads((out / "result.json").read_text())
+
+
+def comparable(result):
+    """What must not depend on how a run was done."""
+    for cloud in result["clouds"]:
+        for stage in cloud["stages"]:
+            del stage["seconds"]
+    for document in result["registrations"]:
+        del document["seconds"]
+    names = ("clouds", "merged", "registrations", "result_hash", "notes")
+    return {name: result[name] for name in names}
+
+
+def bytes_of(out: Path):
+    return {str(p.relative_to(out)): p.read_bytes() for p in sorted(out.rglob("*.laz"))}
+
+
+def test_every_file_is_the_same_on_tiles(folder):
+    results = {name: run(folder, name, room) for name, room in ROOMS.items()}
+    files = {name: bytes_of(folder / name) for name in ROOMS}
+    first = comparable(results["whole"])
+    assert first["registrations"][0]["distances"] is not None
+    assert 0 < first["merged"]["left_out"] < first["merged"]["points"]
+    assert len(files["whole"]) == 6
+    for name in ("few", "many"):
+        assert comparable(results[name]) == first
+        assert files[name].keys() == files["whole"].keys()
+        for path, content in files[name].items():
+            assert content == files["whole"][path], f"{path} differs on {name} tiles"
+    # Nothing is left lying about.
+    assert {path.name for path in folder.iterdir()} == {*ROOMS, "scan.laz", "map.laz"}
+
+
+def test_the_hash_knows_neither_order_nor_threads(folder):
+    threads = get_threads()
+    try:
+        known = run(folder, "one", ROOMS["whole"], "--threads", "1")["result_hash"]
+        write(folder, np.random.default_rng(2))
+        assert run(folder, "two", ROOMS["few"], "--threads", "2")["result_hash"] == known
+    finally:
+        set_threads(threads)
+
+
+@pytest.mark.parametrize("most", [500, 5000])
+def test_a_reduced_cloud_is_the_octrees_level_whatever_the_pieces(most):
+    points = site(3, 0.0, 0.01)
+    cloud = Cloud.from_points(points, row=np.arange(len(points)))
+    parts = np.array_split(np.random.default_rng(4).permutation(len(points)), 7)
+    found = reduced.reduced(lambda: (cloud.select(part) for part in parts), len(cloud), most)
+    root = root_cube(cloud.xyz, OctreeVoxelGrid(depth=20))
+    kept = {}
+    for level in range(1, 15):
+        grid = OctreeVoxelGrid(depth=level)
+        kept[level] = octree_voxel_grid(cloud.xyz, grid, records=cloud.records).is_kept
+    deepest = max(level for level, mask in kept.items() if mask.sum() <= most)
+    assert found.edge_m == pytest.approx(root.edge_m / 2**deepest)
+    rows = np.sort(found.cloud.attribute("row"))
+    np.testing.assert_array_equal(rows, np.flatnonzero(kept[deepest]))
+
+
+def test_a_cloud_that_is_small_enough_is_not_reduced():
+    cloud = Cloud.from_points(site(3, 0.0, 0.01))
+    found = reduced.reduced(lambda: (cloud,), len(cloud), len(cloud))
+    assert found.cloud is cloud
+    assert found.edge_m is None
+
+
+@pytest.mark.parametrize("most", [40, 10_000])
+def test_records_in_parts_are_sorted_as_a_whole(tmp_path, most):
+    rng = np.random.default_rng(5)
+    records = np.zeros(3000, dtype=[("X", "<i4"), ("Y", "<i4"), ("c", "u1"), ("d", "<f8")])
+    for name in ("X", "Y", "c"):
+        records[name] = rng.integers(0, 9, 3000)
+    records["d"] = rng.integers(-2, 2, 3000)
+    hold = Hold(most, tmp_path / "sort")
+    found = np.concatenate(list(in_byte_order(np.array_split(records, 4), 3000, hold)))
+    whole = np.sort(records.view(f"V{records.dtype.itemsize}"))
+    assert found.tobytes() == whole.tobytes()
+    assert not list(tmp_path.rglob("sort-*"))
