@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from dougong.cli import call
-from dougong.evaluation import building_runs
+from dougong.evaluation import building_runs, coarse_trials
 from dougong.evaluation.metrics import pose_errors
 from dougong.evaluation.scenes import make_scene
-from dougong.evaluation.studies import buildings, filtering, storage
+from dougong.evaluation.studies import buildings, coarse, filtering, storage
+from dougong.evaluation.studies.coarse_figure import draw_coarse
 from dougong.evaluation.tabulate import as_text, spread
 
 
@@ -105,3 +106,51 @@ def test_bytes_are_those_of_files(scene, tmp_path):
     whole, part = storage._sizes(scene.photogrammetry), storage._sizes(half)
     assert set(whole) == set(storage.WRITABLE)
     assert all(0.4 < part[suffix] / whole[suffix] < 0.7 for suffix in whole)
+
+
+def test_a_coarse_pose_is_right_by_yaw_and_place_and_goes_both_ways_between_frames(scene):
+    truth, clouds = scene.truth.T_target_source, (scene.lidar, scene.photogrammetry)
+    local = coarse_trials.local_pose(truth, *clouds)
+    np.testing.assert_allclose(coarse_trials.file_pose(local, *clouds), truth, atol=1e-6)
+    turned, shifted = local.copy(), local.copy()
+    turned[:3, :3] = building_rotation(3.0) @ local[:3, :3]
+    shifted[0, 3] += 0.6
+
+    class Ready:
+        source = scene.lidar
+
+    Ready.scene = scene
+    found = [coarse_trials.Hypothesis(T_target_source=T, score=1.0, method="x")
+             for T in (turned, shifted, local)]  # fmt: skip
+    errors = coarse_trials.coarse_errors(Ready, found)
+    assert coarse_trials._right(errors) == [2]
+    assert errors[0][0] == pytest.approx(3.0)
+    assert errors[1][1] == pytest.approx(0.6)
+
+
+def building_rotation(degrees):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def coarse_rows():
+    about = {"on": "buildings", "building": "hall", "points": 9}
+    for seed, status, is_right in ((0, "ok", True), (1, "ambiguous", False), (2, "ok", False)):
+        row = {"is_first_right": is_right, "is_listed": True, "is_fitted": is_right}
+        row |= {"is_correct": is_right, "fitted95_mm": 4.0, "coarse_s": 1.0, "status": status}
+        yield {**about, "seed": seed, "part": "pairs", "method": "plan", **row}
+        for most in (1, 10):
+            step = {"most_iterations_per_level": most, "pose95_mm": 100.0 / most}
+            yield {**about, "seed": seed, "part": "fine iterations", "method": "plan", **step}
+        sample = {"samples": 100, "is_first_right": is_right, "is_listed": True}
+        yield {**about, "seed": seed, "part": "samples", "method": "4pcs", **sample}
+
+
+def test_precision_is_over_what_is_returned_and_recall_over_all(tmp_path):
+    rows = list(coarse_rows())
+    line = coarse.summary(rows)[0]
+    assert (line["n"], line["returned"], line["wrong"]) == (3, 2, 1)
+    assert line["precision_percent"] == 50.0
+    assert line["recall_percent"] == pytest.approx(33.33)
+    draw_coarse(rows, coarse.summary(rows), tmp_path / "x.png")
+    assert (tmp_path / "x.png").stat().st_size > 5000

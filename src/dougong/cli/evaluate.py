@@ -18,6 +18,7 @@ def command(
         "buildings",
         "filtering",
         "storage",
+        "coarse",
     ],
     /,
     *,
@@ -42,7 +43,7 @@ def command(
         probability against how often it is right. hard: hard and impossible pairs.
         buildings: five kinds of building through the whole program, against the truth.
         filtering: octree depth and cloth threshold, and what each costs. storage: bytes before
-        and after, by format.
+        and after, by format. coarse: coarse methods, precision, recall and convergence.
     out
         Folder for the files; default: dougong-STUDY in the current folder.
     quick

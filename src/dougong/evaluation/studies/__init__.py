@@ -31,6 +31,7 @@ STUDIES: Mapping[str, str] = {
     "buildings": "five kinds of building through the whole program, against the truth",
     "filtering": "octree depth and cloth threshold: reduction, and what it costs",
     "storage": "bytes on disk before and after, by format",
+    "coarse": "coarse methods: precision, recall, convergence",
 }
 """Every study by its name, with what it measures."""
 
