@@ -48,7 +48,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr("dougong.app._build_report", lambda *_: None)
     for name, value in (("BASE_BYTES", 0), ("BYTES_PER_POINT", 30), ("LEAST_TILE_POINTS", 100),
                         ("BYTES_PER_WAITING_POINT", 10), ("_BYTES_PER_BOOKED_POINT", 1),
-                        ("_BYTES_PER_TILE_POINT", 40)):  # fmt: skip
+                        ("_BYTES_PER_TILE_POINT", 40), ("BYTES_PER_REDUCED_POINT", 2)):  # fmt: skip
         monkeypatch.setattr(memory, name, value)
     monkeypatch.setattr(reduced, "MOST_POINTS", 6000)
     monkeypatch.setattr(reduced, "LEAST_POINTS", 6000)

@@ -1,6 +1,7 @@
 """`dougong plan` says what `dougong run` does."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -41,8 +42,16 @@ def test_small_clouds_stay_in_memory(site, capsys):
 def test_a_scan_that_does_not_fit_goes_on_tiles(site, capsys, monkeypatch):
     monkeypatch.setattr(memory, "BASE_BYTES", 0)
     monkeypatch.setattr(memory, "LEAST_TILE_POINTS", 100)
+    monkeypatch.setattr(memory, "BYTES_PER_REDUCED_POINT", 50)
     code, plan = planned(site, capsys, "--memory", "4MB")
     assert code == 0
+    stages = {stage["name"]: stage for stage in plan["stages"]}
+    assert list(stages) == [
+        "filter scan", "filter drone", "register", "distances", "merge", "write", "hash", "report",
+    ]  # fmt: skip
+    assert stages["filter scan"]["tiles"] >= 4
+    assert stages["filter drone"]["tiles"] == 0
+    assert plan["work_bytes"] == max(stage["work_bytes"] for stage in plan["stages"])
     scan = plan["files"][0]
     assert scan["way"] == "on tiles"
     assert 100 <= scan["tile_points"] < 30_000
@@ -57,6 +66,24 @@ def test_a_drone_cloud_that_does_not_fit_is_refused_by_plan_and_run_alike(site, 
     assert call(["run", *files, "--out", str(site / "out"), "--memory", "200MB", "--json"]) == 2
     assert json.loads(capsys.readouterr().out)["error"]["message"] == plan["refusal"]
     assert not (site / "out").exists()
+
+
+def test_a_registration_that_does_not_fit_is_refused(site, capsys, monkeypatch):
+    monkeypatch.setattr(memory, "BASE_BYTES", 0)
+    monkeypatch.setattr(memory, "LEAST_TILE_POINTS", 100)
+    monkeypatch.setattr(memory, "BYTES_PER_REDUCED_POINT", 1000)
+    code, plan = planned(site, capsys, "--memory", "4MB")
+    assert code == 2
+    assert "register" in plan["refusal"]
+
+
+def test_a_full_disk_is_refused_before_anything_is_read(site, capsys, monkeypatch):
+    usage = shutil.disk_usage(site)._replace(free=1000)
+    monkeypatch.setattr("dougong.pipeline.plan.shutil.disk_usage", lambda _: usage)
+    files = ["--lidar", str(site / "scan.laz"), "--photogrammetry", str(site / "drone.laz")]
+    assert call(["run", *files, "--out", str(site / "out"), "--memory", "4GB"]) == 1
+    assert "free, and the run needs about" in capsys.readouterr().err
+    assert not list(site.glob("out*"))
 
 
 def test_people_read_a_table(site, capsys):

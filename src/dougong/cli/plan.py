@@ -68,7 +68,23 @@ def _words(document: dict[str, Any]) -> str:
     ]
     if document["refusal"] is not None:
         facts.append(f"would be refused: {document['refusal']}")
-    return "\n".join([_text.table(rows, ("cloud", "file", "points", "how")), *facts])
+    stages = [
+        (
+            stage["name"],
+            f"about {stage['tiles']} tiles" if stage["tiles"] else "in memory",
+            _text.size(stage["memory_bytes"]),
+            _text.size(stage["work_bytes"]),
+            f"{stage['seconds']:.0f} s",
+        )
+        for stage in document["stages"]
+    ]
+    return "\n".join(
+        [
+            _text.table(rows, ("cloud", "file", "points", "how")),
+            _text.table(stages, ("stage", "how", "memory", "disk meanwhile", "CPU time")),
+            *facts,
+        ]
+    )
 
 
 def _way(file: dict[str, Any]) -> str:

@@ -45,6 +45,8 @@ class Loader:
     clock: Clock
     shown: Callable[[Path], str]
     room: Room
+    scratch: Path
+    """Gets what is of use to this run only."""
     inputs: dict[Path, dict[str, Any]] = field(default_factory=dict)
     waiting: int = 0
     """Filtered points that wait in memory."""
@@ -54,7 +56,7 @@ class Loader:
     def hold(self) -> Hold:
         """Return how many points may be held beside those that wait, and where the others go."""
         most = self.room.most_tile_points(0, self.waiting) or LEAST_TILE_POINTS
-        return Hold(most, self.store.folder / "run")
+        return Hold(most, self.scratch)
 
     def movers(self, entry: Entry, scale: ScaleSearch | None = None) -> list[Mover]:
         """Return what moves as one of a project's cloud, read and filtered.
@@ -176,7 +178,7 @@ class Loader:
             self.progress.stage(f"{file.stem}: reading what is left")
             with self.clock.measure("read"):
                 chunks = (self._placed(entry, chunk) for chunk in raw)
-                kept, removed = spooled(chunks, known, self.store.folder / f"kept-{key[:16]}")
+                kept, removed = spooled(chunks, known, self.scratch / f"kept-{key[:16]}")
             yield self._source(entry, file, station, kept, known, known.noticed, removed)
 
     def _tiles_key(self, entry: Entry, digest: str, station: int) -> str:

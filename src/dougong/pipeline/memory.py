@@ -14,6 +14,8 @@ from dougong.formats import describe
 BASE_BYTES = 800_000_000
 BYTES_PER_POINT = 230
 BYTES_PER_WAITING_POINT = 110
+BYTES_PER_REDUCED_POINT = 130
+"""Of a cloud on disk, as the registration and the distances hold it."""
 _BYTES_PER_TILE_POINT = 250
 _BYTES_PER_BOOKED_POINT = 7
 """Of a cloud on tiles, the reason, the ground class and the details of every point are held."""
@@ -76,6 +78,11 @@ def tiles_bytes(points: int, tile_points: int, waiting: int = 0) -> int:
     """Return the memory that a cloud of `points` needs on tiles of at most `tile_points`."""
     held = waiting * BYTES_PER_WAITING_POINT + points * _BYTES_PER_BOOKED_POINT
     return BASE_BYTES + held + tile_points * _BYTES_PER_TILE_POINT
+
+
+def registering_bytes(reduced: int, waiting: int) -> int:
+    """Return the memory of a registration of clouds of `reduced` points beside those that wait."""
+    return BASE_BYTES + waiting * BYTES_PER_WAITING_POINT + reduced * BYTES_PER_REDUCED_POINT
 
 
 def _free_bytes() -> float:

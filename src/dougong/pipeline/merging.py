@@ -28,7 +28,7 @@ from dougong.cloud import Frame, Pieces
 from dougong.filters.neighbourhood import build_index, nearest
 from dougong.formats.model import Hold
 from dougong.params import Parameters
-from dougong.pipeline.sides import Tiles, cut, whole
+from dougong.pipeline.sides import HALO_SHARE, Tiles, cut, whole
 from dougong.pipeline.zones import Zones, ZoneSums, grid_over
 from dougong.typing import Index, Kind, Mask, Points, Values
 
@@ -147,8 +147,8 @@ def _tiles_of(one: Sequence[Part], other: Sequence[Part], hold: Hold | None) -> 
     ]
     if hold is None or sum(part.points for part in (*one, *other)) <= hold.points:
         return whole(*(np.concatenate(list(stream)) for stream in streams))
-    # A third of the room is for the tile, the others for its halo.
-    return cut((streams[0], streams[1]), hold.folder / "merge", max(hold.points // 3, 1))
+    most = max(hold.points // HALO_SHARE, 1)
+    return cut((streams[0], streams[1]), hold.folder / "merge", most)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

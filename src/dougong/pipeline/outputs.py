@@ -69,6 +69,27 @@ def refuse_output(input: Path, output: Path, files: Sequence[Path], overwrite: b
         raise OutputError(msg)
 
 
+@contextmanager
+def scratch_folder(folder: Path) -> Iterator[Path]:
+    """Make `folder`, empty, and delete it in the end; what a killed run left there goes too.
+
+    Raises
+    ------
+    OutputError
+        It cannot be made.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        msg = f"{folder} cannot be made: {error.strerror or error}. Pass another --work."
+        raise OutputError(msg) from error
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file so that it is there whole or not at all.
 

@@ -8,47 +8,24 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from dougong.errors import InputError, OutputError
 from dougong.formats import FileInfo, describe
-from dougong.pipeline.memory import Room, estimated_bytes, tiles_bytes
+from dougong.pipeline.memory import Room, estimated_bytes
+from dougong.pipeline.plan_stages import PlannedFile, PlannedStage, Way, planned_stages
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Entry, Project, files_of
 from dougong.threads import get_threads
-from dougong.typing import Kind
 
-# CPU seconds per million points, measured on one core (LAZ, a scanned hall of 3e6 points).
-_READ, _TILES, _WRITE = 0.6, 2.0, 1.4
-_FILTER = {"lidar": 4.6, "photogrammetry": 3.9}
-_PAIR_SECONDS = 20.0
-_REPORT_SECONDS = 5.0
 _PARALLEL = 0.8
 """Share of that work which threads divide."""
 
 LONG_SECONDS = 120.0
 """A run that may take longer is announced with its plan."""
 _QUICK_BYTES = 100_000_000
-_TILE_ROW_BYTES = 32
 _OUT_BYTES_PER_POINT = 12
 """Of compressed points with colour; every kept point is written twice (its cloud, merged)."""
-
-Way = Literal["in memory", "on tiles", "too large"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedFile:
-    """One input file and how it would be worked on."""
-
-    path: str
-    cloud: str
-    kind: Kind
-    points: int
-    bytes: int
-    stations: int
-    way: Way
-    tile_points: int | None
-    """Most points of a tile; None: no tiles."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,8 +35,9 @@ class Plan:
     files: tuple[PlannedFile, ...]
     reference: str
     """Name of the project's cloud whose frame the result is in."""
+    stages: tuple[PlannedStage, ...]
     memory_bytes: int
-    """Peak, estimated; where a voxel grid runs on tiles, without what it leaves."""
+    """Peak, estimated."""
     memory_limit_bytes: int | None
     """What ``--memory`` allows, or four fifths of what is free; None: unknown."""
     work_bytes: int
@@ -114,14 +92,22 @@ def plan_run(
             row_bytes[planned.path] = _row_bytes(told)
             refusals += [refusal] if refusal else []
     full = project.project.full_resolution
+    stages = planned_stages(files, row_bytes, room, full=full)
+    most = max(stages, key=lambda stage: stage.memory_bytes)
+    if room.is_asked and most.memory_bytes > room.bytes:
+        refusals.append(
+            f"the stage {most.name!r} needs about {most.memory_bytes / 1e9:.1f} GB, more than "
+            f"{room.name()}, however small the tiles. Raise it."
+        )
     return Plan(
         files=tuple(files),
         reference=project.reference(),
-        memory_bytes=_peak(files),
+        stages=stages,
+        memory_bytes=max(stage.memory_bytes for stage in stages),
         memory_limit_bytes=None if room.bytes == float("inf") else int(room.bytes),
-        work_bytes=_work_bytes(files, row_bytes),
+        work_bytes=max(stage.work_bytes for stage in stages),
         out_bytes=_out_bytes(files, full),
-        seconds=_seconds(files, full),
+        seconds=_wall(sum(stage.seconds for stage in stages)),
         refusal=refusals[0] if refusals else None,
     )
 
@@ -166,37 +152,13 @@ def _row_bytes(told: FileInfo) -> int:
     return 8 + 4 * len(told.attributes)
 
 
-def _peak(files: Sequence[PlannedFile]) -> int:
-    held = [file.points for file in files if file.way != "on tiles"]
-    tiles = [tiles_bytes(file.points, file.tile_points) for file in files if file.tile_points]
-    return max([estimated_bytes(held), *tiles])
-
-
-def _work_bytes(files: Sequence[PlannedFile], row_bytes: dict[str, int]) -> int:
-    """Return the disk that the largest cloud on tiles takes, and the books of all."""
-    tiles = [
-        2 * file.points * (row_bytes[file.path] + _TILE_ROW_BYTES)
-        for file in files
-        if file.way == "on tiles"
-    ]
-    return max(tiles, default=0) + 2 * sum(file.points for file in files)
-
-
 def _out_bytes(files: Sequence[PlannedFile], full: bool) -> int:
     copies = sum(file.bytes for file in files) if full else 0
     return 2 * _OUT_BYTES_PER_POINT * sum(file.points for file in files) + copies
 
 
-def _seconds(files: Sequence[PlannedFile], full: bool) -> float:
-    work = 0.0
-    for file in files:
-        millions = file.points / 1e6
-        each = _READ + _FILTER[file.kind] + 2.0 * _WRITE
-        each += _TILES if file.way == "on tiles" else 0.0
-        each += _READ + _WRITE if full else 0.0
-        work += each * millions
-    work += _PAIR_SECONDS * max(len({file.cloud for file in files}) - 1, 0) + _REPORT_SECONDS
-    return work * (1.0 - _PARALLEL + _PARALLEL / get_threads())
+def _wall(cpu_seconds: float) -> float:
+    return cpu_seconds * (1.0 - _PARALLEL + _PARALLEL / get_threads())
 
 
 def refuse_full_work_disk(plan: Plan, work: Path) -> None:
@@ -205,14 +167,15 @@ def refuse_full_work_disk(plan: Plan, work: Path) -> None:
     Raises
     ------
     OutputError
-        The disk of `work` has less free than half of the upper bound: tiles are compressed.
+        The disk of `work` has less free than half of the upper bound, for what is written
+        meanwhile and the result, which lies beside it as a rule: both are compressed.
     """
-    need = plan.work_bytes // 2
+    need = (plan.work_bytes + plan.out_bytes) // 2
     folder = next(path for path in (work, *work.absolute().parents) if path.is_dir())
     free = shutil.disk_usage(folder).free
     if need > free:
         msg = (
-            f"{folder} has {free / 1e9:.1f} GB free, and the tiles need about {need / 1e9:.1f} GB. "
+            f"{folder} has {free / 1e9:.1f} GB free, and the run needs about {need / 1e9:.1f} GB. "
             "Free some space or pass another --work."
         )
         raise OutputError(msg)

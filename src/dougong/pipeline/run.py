@@ -1,6 +1,7 @@
 """The main job: read, filter, register every cloud onto the reference, merge, write."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,9 @@ from dougong.pipeline.full_resolution import Place, full_notes, write_full_resol
 from dougong.pipeline.links import Linked, measured_link
 from dougong.pipeline.loading import Loader
 from dougong.pipeline.memory import Room
-from dougong.pipeline.movers import ReducedClouds
-from dougong.pipeline.network import register_all
-from dougong.pipeline.outputs import write_json
+from dougong.pipeline.movers import Mover, ReducedClouds
+from dougong.pipeline.network import Frames, register_all
+from dougong.pipeline.outputs import scratch_folder, write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Project
 from dougong.pipeline.provenance import Clock, peak_memory_bytes, software
@@ -34,6 +35,7 @@ from dougong.pipeline.run_document import (
 from dougong.pipeline.scaling import load_all
 from dougong.pipeline.store import Store
 from dougong.pipeline.writing import write_clouds, write_registrations
+from dougong.registration.control_solve import ControlPoints
 
 _WORST = ("failed", "ambiguous", "ok")
 
@@ -71,34 +73,36 @@ def run(
     dict
         The document of result.json.
     """
-    clock = Clock()
-    loader = Loader(
-        folder=folder,
-        recipe=project.filter,
-        store=store,
-        progress=progress,
-        clock=clock,
-        shown=shown,
-        room=room or Room.of(None),
-    )
-    control = control_of_project(project, folder)
+    with scratch_folder(store.folder / "run") as scratch:
+        loader = Loader(
+            folder=folder,
+            recipe=project.filter,
+            store=store,
+            progress=progress,
+            clock=Clock(),
+            shown=shown,
+            room=room or Room.of(None),
+            scratch=scratch,
+        )
+        result: dict[str, Any] = finite(_result(project, loader, out))
+    write_json(out / "result.json", result)
+    return result
+
+
+def _result(project: Project, loader: Loader, out: Path) -> dict[str, Any]:
+    """Do the work and write all but result.json, whose document is returned."""
+    clock, progress = loader.clock, loader.progress
+    control = control_of_project(project, loader.folder)
     movers = load_all(project, loader, control)
     reference = next(mover for mover in movers if mover.entry == project.reference())
-    clouds = ReducedClouds(movers)
-    with clock.measure("register"):
-        found = register_all(movers, reference, project.registration, control, progress, clouds)
-        linked = found.linked
-    with clock.measure("distances"):
-        linked = [measured_link(link, reference, clouds, progress) for link in linked]
-    clouds.forget()
-    hold = loader.hold()
+    found = _registered(project, loader, movers, reference, control)
+    linked, hold = found.linked, loader.hold()
     documents = registration_documents(linked, reference, loader)
     for link in linked:
         if link.measured is not None:
             write_distances(link.measured, out / DISTANCES / f"{link.mover.name}.laz")
-    with clock.measure("write"):
-        merged = write_clouds(linked, reference.frame, project.merge, out, progress, hold)
-    write_registrations(documents, linked, reference, out, shown)
+    merged = write_clouds(linked, reference.frame, project.merge, out, progress, clock, hold)
+    write_registrations(documents, linked, reference, out, loader.shown)
     full = None
     if project.project.full_resolution:
         with clock.measure("full_resolution"):
@@ -108,14 +112,14 @@ def run(
                 out,
                 reference=reference.name,
                 inputs=loader.inputs,
-                shown=shown,
+                shown=loader.shown,
                 progress=progress,
             )
     with clock.measure("hash"):
         digest = result_hash(linked, reference.frame, hold)
     statuses = [document["status"] for document in documents] or ["ok"]
     quality = quality_document(project.quality.required_level, documents)
-    result: dict[str, Any] = {
+    return {
         "status": min(statuses, key=_WORST.index),
         "is_settled": all(link.is_sure for link in linked) and quality["is_reached"] is not False,
         "quality": quality,
@@ -131,13 +135,26 @@ def run(
         "finished_utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "result_hash": digest,
         "software": software(),
-        "parameters": project_document(project, shown),
+        "parameters": project_document(project, loader.shown),
         "inputs": list(loader.inputs.values()),
         "notes": [*notes_of(linked), *full_notes(full)],
     }
-    result = finite(result)
-    write_json(out / "result.json", result)
-    return result
+
+
+def _registered(
+    project: Project,
+    loader: Loader,
+    movers: Sequence[Mover],
+    reference: Mover,
+    control: Mapping[str, ControlPoints],
+) -> Frames:
+    """Register all clouds, reduced, and measure what is left between them."""
+    clouds, progress = ReducedClouds(movers), loader.progress
+    with loader.clock.measure("register"):
+        found = register_all(movers, reference, project.registration, control, progress, clouds)
+    with loader.clock.measure("distances"):
+        linked = [measured_link(link, reference, clouds, progress) for link in found.linked]
+    return replace(found, linked=linked)
 
 
 def _places(linked: Sequence[Linked]) -> list[Place]:

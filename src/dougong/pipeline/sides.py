@@ -25,6 +25,10 @@ from dougong.tiles.grid import grid_for
 from dougong.tiles.spool import Spool
 from dougong.typing import Index, Mask, Points
 
+HALO_SHARE = 3
+"""A tile holds at most this share of the points that fit: the others are for its halo."""
+TILE_ROW_BYTES = 73
+"""Of a point on disk while the tiles are cut: twice its coordinates, once its place in the cut."""
 _STEP_M = 0.1
 """Tiles are whole numbers of such steps wide."""
 

@@ -25,6 +25,7 @@ from dougong.filters.selection import DETAIL, MARGIN, Reason
 from dougong.formats import describe, iterate, require_metric
 from dougong.pipeline.memory import Room
 from dougong.pipeline.progress import Progress
+from dougong.pipeline.sides import HALO_SHARE
 from dougong.pipeline.steps import StageCount, Step, doubts, nothing_kept
 from dougong.pipeline.store import Books
 from dougong.tiles.cloud import POINTS, TiledCloud, load_tiles, read_arrays
@@ -37,8 +38,6 @@ from dougong.tiles.work import state_of
 CHUNK_POINTS = 1_000_000
 _LEAST_BYTES_PER_POINT = 4
 """No format packs points of a real scan into less."""
-_HALO_SHARE = 3
-"""A tile holds at most this share of the points that fit: the others are for its halo."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,7 +148,7 @@ def filter_chunks(
         tiles = load_tiles(scratch)
         if tiles is None:
             most = room.tile_points(points, waiting)
-            kept = max(most // (_HALO_SHARE * engine.width), 1)
+            kept = max(most // (HALO_SHARE * engine.width), 1)
             tiles = _cut(chunks, job, most, kept, scratch, progress)
         name = tiles.facts["name"]
         stages = [_grid_stage(tiles, time.perf_counter() - start)] if job.grid is not None else []

@@ -10,9 +10,10 @@ from dougong.formats.model import Hold
 from dougong.pipeline.distances import Painter
 from dougong.pipeline.exports import Ends, write_registration
 from dougong.pipeline.links import Linked
-from dougong.pipeline.merging import Merge, Part, choose
+from dougong.pipeline.merging import Merge, Merged, Part, choose
 from dougong.pipeline.movers import Mover
 from dougong.pipeline.progress import Progress
+from dougong.pipeline.provenance import Clock
 from dougong.typing import Mask
 
 MERGED = "merged.copc.laz"
@@ -25,6 +26,7 @@ def write_clouds(
     merge: Merge,
     out: Path,
     progress: Progress,
+    clock: Clock,
     hold: Hold,
 ) -> dict[str, Any]:
     """Write each filtered cloud and the merged one; return what the merged one holds."""
@@ -35,7 +37,8 @@ def write_clouds(
         progress.stage(f"writing clouds/{link.mover.name}.laz")
         kept = [source.kept for source in link.mover.sources]
         clouds = [link.placed_pieces(one, reference) for one in kept]
-        _write_one(clouds, out / "clouds" / f"{link.mover.name}.laz", source_id, hold)
+        with clock.measure("write"):
+            _write_one(clouds, out / "clouds" / f"{link.mover.name}.laz", source_id, hold)
         removed = [source.removed for source in link.mover.sources if len(source.removed)]
         if removed:
             placed = [in_pieces(link.placed(cloud, reference)) for cloud in removed]
@@ -56,26 +59,22 @@ def write_clouds(
                 )
             )
             painted.append(pieces if paint is None else paint.pieces(pieces))
+    progress.stage("choosing what is merged")
+    with clock.measure("merge"):
+        chosen = choose(parts, merge, hold)
     progress.stage(f"writing {MERGED}")
-    return {"file": MERGED, **_write_merged(parts, painted, merge, out / MERGED, progress, hold)}
+    with clock.measure("write"):
+        write_merged(
+            [_left(pieces, kept) for pieces, kept in zip(painted, chosen.kept, strict=True)],
+            out / MERGED,
+            source_ids=[part.source_id for part in parts],
+            hold=hold,
+        )
+    return {"file": MERGED, **_merged_document(parts, chosen, progress)}
 
 
-def _write_merged(
-    parts: Sequence[Part],
-    painted: Sequence[Pieces],
-    merge: Merge,
-    path: Path,
-    progress: Progress,
-    hold: Hold,
-) -> dict[str, Any]:
-    """Write what is chosen of the sure clouds as one; return what it holds and what it does not."""
-    chosen = choose(parts, merge, hold)
-    write_merged(
-        [_chosen(pieces, kept) for pieces, kept in zip(painted, chosen.kept, strict=True)],
-        path,
-        source_ids=[part.source_id for part in parts],
-        hold=hold,
-    )
+def _merged_document(parts: Sequence[Part], chosen: Merged, progress: Progress) -> dict[str, Any]:
+    """Return what the merged cloud holds and what it does not, and say the latter."""
     document = chosen.document(parts)
     for name, row in document["sources"].items():
         if row["left_out"]:
@@ -87,7 +86,7 @@ def _write_merged(
     return {**document, "clouds": list(ids), "source_ids": ids}
 
 
-def _chosen(pieces: Pieces, kept: Mask) -> Pieces:
+def _left(pieces: Pieces, kept: Mask) -> Pieces:
     """Return the pieces of a cloud without the points that are not `kept`."""
 
     def left() -> Iterator[Cloud]:

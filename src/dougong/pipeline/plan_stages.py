@@ -1,0 +1,158 @@
+"""What each stage of a run holds, writes meanwhile, and takes: upper bounds and rough rates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from dougong.pipeline.memory import (
+    LEAST_TILE_POINTS,
+    Room,
+    estimated_bytes,
+    registering_bytes,
+    tiles_bytes,
+)
+from dougong.pipeline.reduced import most_points
+from dougong.pipeline.sides import HALO_SHARE, TILE_ROW_BYTES
+from dougong.typing import Kind
+
+Way = Literal["in memory", "on tiles", "too large"]
+
+# CPU seconds per million points, measured on one core (LAZ, a scanned hall of 3e6 points; what
+# follows the filters: benchmarks/large_site.py at 1e7).
+_READ, _TILES, _WRITE, _MERGE, _HASH = 0.6, 2.0, 1.4, 1.5, 0.4
+_FILTER = {"lidar": 4.6, "photogrammetry": 3.9}
+_PAIR_SECONDS, _DISTANCE_SECONDS, _REPORT_SECONDS = 20.0, 4.0, 5.0
+_SPOOL_ROW_BYTES = 32
+"""Of a point on disk beside its record: its place and its coordinates."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedFile:
+    """One input file and how it would be worked on."""
+
+    path: str
+    cloud: str
+    kind: Kind
+    points: int
+    bytes: int
+    stations: int
+    way: Way
+    tile_points: int | None
+    """Most points of a tile; None: no tiles."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedStage:
+    """One stage of a run, as if the filters took nothing."""
+
+    name: str
+    tiles: int
+    """About so many; 0: in memory."""
+    memory_bytes: int
+    work_bytes: int
+    """Disk in use meanwhile, before compression."""
+    seconds: float
+    """CPU seconds."""
+
+
+def planned_stages(
+    files: Sequence[PlannedFile], row_bytes: Mapping[str, int], room: Room, *, full: bool
+) -> tuple[PlannedStage, ...]:
+    """Return the stages of a run in order.
+
+    Parameters
+    ----------
+    files : sequence of PlannedFile
+    row_bytes : mapping of str to int
+        Bytes of a record, by path.
+    room : Room
+    full : bool
+        Every file is written again at full resolution.
+    """
+    stages: list[PlannedStage] = []
+    waiting = kept_bytes = 0
+    for file in files:
+        stages.append(_filter_stage(file, row_bytes[file.path], waiting, kept_bytes))
+        if file.way == "on tiles":
+            kept_bytes += file.points * (row_bytes[file.path] + _SPOOL_ROW_BYTES)
+        else:
+            waiting += file.points
+    return (*stages, *_later_stages(files, row_bytes, room, kept_bytes, full=full))
+
+
+def _filter_stage(file: PlannedFile, row: int, waiting: int, kept_bytes: int) -> PlannedStage:
+    millions = file.points / 1e6
+    seconds = (_READ + _FILTER[file.kind]) * millions
+    books = 2 * file.points
+    if file.tile_points is None:
+        memory = estimated_bytes([file.points, waiting])
+        return PlannedStage(
+            name=f"filter {file.cloud}",
+            tiles=0,
+            memory_bytes=memory,
+            work_bytes=kept_bytes + books,
+            seconds=seconds,
+        )
+    return PlannedStage(
+        name=f"filter {file.cloud}",
+        tiles=_tiles(file.points, file.tile_points),
+        memory_bytes=tiles_bytes(file.points, file.tile_points, waiting),
+        work_bytes=kept_bytes + books + 2 * file.points * (row + _SPOOL_ROW_BYTES),
+        seconds=seconds + (_TILES + _READ) * millions,
+    )
+
+
+def _tiles(points: int, most: int) -> int:
+    """Return about how many tiles hold `points`, each with its halo at most `most`."""
+    return max(1, -(-points * HALO_SHARE // most))
+
+
+def _later_stages(
+    files: Sequence[PlannedFile],
+    row_bytes: Mapping[str, int],
+    room: Room,
+    kept_bytes: int,
+    *,
+    full: bool,
+) -> list[PlannedStage]:
+    held = [file.points for file in files if file.way != "on tiles"]
+    points = sum(file.points for file in files)
+    records = sum(file.points * row_bytes[file.path] for file in files)
+    largest = max((file.points * row_bytes[file.path] for file in files), default=0)
+    clouds = len({file.cloud for file in files})
+    most = room.most_tile_points(0, sum(held)) or LEAST_TILE_POINTS
+    whole = estimated_bytes(held)
+    parts = tiles_bytes(0, min(points, most), sum(held))
+    reduced = sum(min(file.points, most_points(clouds)) for file in files if file.way == "on tiles")
+    registering = max(whole, registering_bytes(reduced, sum(held)))
+    is_cut = points > most
+    millions = points / 1e6
+    pairs = max(clouds - 1, 0)
+    rows: list[tuple[str, int, int, int, float]] = []
+    if pairs:
+        rows += [
+            ("register", 0, registering, 0, _PAIR_SECONDS * pairs + 0.3 * millions),
+            ("distances", 0, registering, 0, _DISTANCE_SECONDS * pairs),
+        ]
+        tiles = _tiles(points, most) if is_cut else 0
+        disk = points * TILE_ROW_BYTES if is_cut else 0
+        rows.append(("merge", tiles, parts if is_cut else whole, disk, _MERGE * millions))
+    tail = parts if is_cut else whole
+    rows.append(("write", 0, tail, 2 * records if is_cut else 0, 2.0 * _WRITE * millions))
+    if full:
+        rows.append(("full resolution", 0, whole, 0, (_READ + _WRITE) * millions))
+    rows.append(("hash", 0, tail, largest if is_cut else 0, _HASH * millions))
+    rows.append(("report", 0, whole, 0, _REPORT_SECONDS))
+    books = 2 * points
+    return [
+        PlannedStage(
+            name=name,
+            tiles=tiles,
+            memory_bytes=memory,
+            work_bytes=kept_bytes + books + disk,
+            seconds=seconds,
+        )
+        for name, tiles, memory, disk, seconds in rows
+    ]
