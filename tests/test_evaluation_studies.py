@@ -9,7 +9,7 @@ from dougong.cli import call
 from dougong.evaluation import building_runs, coarse_trials
 from dougong.evaluation.metrics import pose_errors
 from dougong.evaluation.scenes import make_scene
-from dougong.evaluation.studies import buildings, coarse, filtering, storage
+from dougong.evaluation.studies import Setting, buildings, coarse, filtering, growth, storage
 from dougong.evaluation.studies.coarse_figure import draw_coarse
 from dougong.evaluation.tabulate import as_text, spread
 
@@ -153,4 +153,23 @@ def test_precision_is_over_what_is_returned_and_recall_over_all(tmp_path):
     assert line["precision_percent"] == 50.0
     assert line["recall_percent"] == pytest.approx(33.33)
     draw_coarse(rows, coarse.summary(rows), tmp_path / "x.png")
+    assert (tmp_path / "x.png").stat().st_size > 5000
+
+
+def test_sizes_go_up_to_the_largest_two_a_decade():
+    assert growth.sizes(Setting(points=300_000)) == [30_000, 94_868, 300_000]
+    assert growth.sizes(Setting(points=20_000)) == [20_000]
+    assert growth.sizes(Setting(points=200_000))[-1] == 200_000
+
+
+def test_the_check_error_of_growth_is_the_poses_own(scene, tmp_path):
+    pose = scene.truth.T_best.copy()
+    pose[2, 3] += 0.03
+    assert growth.check_rmse_m(pose, scene.truth) == pytest.approx(0.03, rel=1e-6)
+    about = {"coarse": "plan", "fine": "point-to-plane", "status": "ok", "points_aimed": 9}
+    figures = dict.fromkeys(growth.FIGURES, 2.0)
+    rows = [{**about, "seed": seed, "points": 10, **figures} for seed in (0, 1)]
+    (line,) = growth.summary(rows)
+    assert (line["n"], line["ok"], line["points"], line["check_rmse_mm"]) == (2, 2, 10, 2.0)
+    growth.draw_growth([line], tmp_path / "x.png")
     assert (tmp_path / "x.png").stat().st_size > 5000

@@ -19,6 +19,7 @@ def command(
         "filtering",
         "storage",
         "coarse",
+        "growth",
     ],
     /,
     *,
@@ -44,6 +45,7 @@ def command(
         buildings: five kinds of building through the whole program, against the truth.
         filtering: octree depth and cloth threshold, and what each costs. storage: bytes before
         and after, by format. coarse: coarse methods, precision, recall and convergence.
+        growth: errors, seconds and memory against the number of points.
     out
         Folder for the files; default: dougong-STUDY in the current folder.
     quick

@@ -32,6 +32,7 @@ STUDIES: Mapping[str, str] = {
     "filtering": "octree depth and cloth threshold: reduction, and what it costs",
     "storage": "bytes on disk before and after, by format",
     "coarse": "coarse methods: precision, recall, convergence",
+    "growth": "errors, seconds and memory against the number of points",
 }
 """Every study by its name, with what it measures."""
 
