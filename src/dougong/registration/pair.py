@@ -36,7 +36,7 @@ from dougong.registration.prepare import Prepared, prepare
 from dougong.registration.result import Hypothesis, Registration
 from dougong.registration.sanity import is_mirrored, propose_scale
 from dougong.registration.settings import Register
-from dougong.registration.starting_poses import coarse_poses, heard, picked_poses
+from dougong.registration.starting_poses import coarse_poses, heard, picked_poses, with_delivered
 from dougong.typing import Kind
 
 
@@ -170,6 +170,8 @@ def _starts(
     picked = [] if fit is None else picked_poses(fit, source, target)
     is_searched = fit is None or params.coarse != "none"
     found = coarse_poses(source, target, *frames, params) if is_searched else []
+    if params.coarse != "none":
+        found = with_delivered(found, source, target, *frames)
     if control is not None and control.T_target_source is not None:
         found = [heard(control.T_target_source, "control", source, target), *found]
     return [*picked, *found]

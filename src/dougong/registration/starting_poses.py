@@ -27,14 +27,44 @@ def heard(T: Transform, method: str, source: Prepared, target: Prepared) -> Hypo
     return Hypothesis(T_target_source=T, score=ranking.score(T, source, target), method=method)
 
 
+_DELIVERED_SHARE = 0.5
+"""The pose that two clouds come with is heard where it scores this much of the search's best."""
+
+
+def with_delivered(
+    found: list[Hypothesis],
+    source: Prepared,
+    target: Prepared,
+    source_frame: Frame,
+    target_frame: Frame,
+) -> list[Hypothesis]:
+    """Return the found poses and, second, the one that the files' own coordinates say.
+
+    Scanners write the poses of their own registration (E57, PTX), and surveyors deliver clouds in
+    one system: where that is nearly true it should not depend on a search. It is one start among
+    others, and proven as they are.
+    """
+    pose = as_delivered(source, target, source_frame, target_frame, "delivered")
+    best = max((hypothesis.score for hypothesis in found), default=0.0)
+    is_heard = pose.score > 0.0 and pose.score >= _DELIVERED_SHARE * best
+    return [*found[:1], pose, *found[1:]] if is_heard else found
+
+
+def as_delivered(
+    source: Prepared, target: Prepared, source_frame: Frame, target_frame: Frame, method: str
+) -> Hypothesis:
+    """Return the pose that takes the files' own coordinates for one system."""
+    T = np.eye(4)
+    T[:3, 3] = source_frame.origin - target_frame.origin
+    return heard(T, method, source, target)
+
+
 def coarse_poses(
     source: Prepared, target: Prepared, source_frame: Frame, target_frame: Frame, params: Register
 ) -> list[Hypothesis]:
     """Return the starting poses of the chosen method, best first, in local frames."""
     if params.coarse == "none":
-        T = np.eye(4)
-        T[:3, 3] = source_frame.origin - target_frame.origin
-        return [heard(T, "none", source, target)]
+        return [as_delivered(source, target, source_frame, target_frame, "none")]
     if params.coarse == "improved-pca":
         return list(improved_pca(source, target))
     if params.coarse == "pca":
