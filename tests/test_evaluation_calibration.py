@@ -21,6 +21,7 @@ from dougong.registration.probability import BELIEF, MOST_PROBABLE, Belief, Evid
 
 def evidence(**changes):
     usual = {"sharpness": 8.0, "explained": 0.8, "violation": 0.0, "spread_m": 0.02}
+    usual["is_undecided"] = False
     return Evidence(**{**usual, "rivals": (1e-4, 1e-5), **changes})
 
 
@@ -61,6 +62,7 @@ def test_more_evidence_never_makes_a_pose_less_probable(better):
     less, more = BELIEF.probability(evidence()), BELIEF.probability(evidence(**better))
     assert 0.0 <= less <= more <= MOST_PROBABLE
     assert BELIEF.probability(evidence(violation=0.07)) <= less
+    assert BELIEF.probability(evidence(is_undecided=True)) <= less
 
 
 def test_equal_rivals_share_the_belief():
@@ -73,7 +75,7 @@ def test_equal_rivals_share_the_belief():
 def test_the_fit_finds_a_belief_that_is_known():
     # Rows drawn from known coefficients: the fit's probabilities come back, not just its shape.
     rng = np.random.default_rng(0)
-    true = Belief(trust=(-3.0, 1.5, 1.0, 5.0, 0.5), rival_power=0.4)
+    true = Belief(trust=(-3.0, 1.5, 1.0, 5.0, 0.5, 1.5), rival_power=0.4)
     rows = []
     for _ in range(3000):
         seen = Evidence(
@@ -82,6 +84,7 @@ def test_the_fit_finds_a_belief_that_is_known():
             violation=float(rng.uniform(0, 0.08)),
             spread_m=float(np.exp(rng.uniform(-5, -2))),
             rivals=tuple(10.0 ** rng.uniform(-6, 0, rng.integers(0, 5))),
+            is_undecided=bool(rng.random() < 0.4),
         )
         p = true.probability(seen)
         rows.append(

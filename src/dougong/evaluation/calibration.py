@@ -17,7 +17,7 @@ from dougong.registration.decision import Found, decide
 from dougong.registration.icp import Icp
 from dougong.registration.plan_search import PlanSearch, plan_search
 from dougong.registration.prepare import Prepare, prepare
-from dougong.registration.probability import BELIEF, MOST_PROBABLE, Belief, Evidence, shares
+from dougong.registration.probability import MOST_PROBABLE, Belief, Evidence, shares
 from dougong.registration.settings import Register
 from dougong.typing import Mask, Values
 
@@ -27,8 +27,8 @@ SETTINGS = Register(
 )
 """Thinned: what fewer peaks and points lose, the verdict has to notice."""
 BINS = 15
-_EXPECTED = np.array([*BELIEF.trust, BELIEF.rival_power])
-_DOUBT = np.array([2.0, 1.0, 2.0, 10.0, 0.5, 0.5])
+_EXPECTED = np.array([0.0, 1.0, 2.0, 10.0, 0.5, 2.0, 0.5])
+_DOUBT = np.array([4.0, 2.0, 4.0, 10.0, 1.0, 5.0, 1.0])
 """What the coefficients are taken to be, and to how much, before any pair is seen: a few pairs
 in which nothing failed would else make every pose certain. Thousands of pairs outweigh it."""
 
@@ -55,6 +55,7 @@ def measure(kind: str, seed: int, settings: Register = SETTINGS) -> dict[str, An
         "violation": evidence.violation,
         "spread_m": evidence.spread_m,
         "rivals": list(evidence.rivals),
+        "is_undecided": evidence.is_undecided,
     }
 
 
@@ -85,6 +86,7 @@ def evidence_of(row: Row) -> Evidence | None:
         violation=row["violation"],
         spread_m=np.inf if row["spread_m"] is None else row["spread_m"],
         rivals=tuple(row["rivals"]),
+        is_undecided=row["is_undecided"],
     )
 
 
@@ -110,7 +112,7 @@ def fit(rows: Sequence[Row]) -> Belief:
         likely = np.where(is_correct, np.log(p), np.log1p(-p)).sum()
         return float(-likely + 0.5 * np.square((numbers - _EXPECTED) / _DOUBT).sum())
 
-    bounds = [(-20.0, 20.0), *[(0.0, 50.0)] * 4, (0.05, 3.0)]
+    bounds = [(-20.0, 20.0), *[(0.0, 50.0)] * 5, (0.05, 3.0)]
     best = optimize.minimize(cost, _EXPECTED, method="L-BFGS-B", bounds=bounds)
     return Belief(trust=tuple(float(x) for x in best.x[:-1]), rival_power=float(best.x[-1]))
 

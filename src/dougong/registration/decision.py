@@ -86,7 +86,7 @@ def decide(
         status, reason = weigh_height(reason, left_open)
         if status != "ok":
             # The other side of the roof is one more pose that fits as well.
-            evidence = replace(evidence, rivals=(*evidence.rivals, 1.0))
+            evidence = replace(evidence, rivals=(*evidence.rivals, 1.0), is_undecided=True)
     if status == "ok":
         hand = handedness(court, levels, ruling.winner, quick, params.verdict)
         if hand == "left":
@@ -116,6 +116,7 @@ def _evidence(ruling: Ruling, spread_m: float) -> Evidence:
         violation=ruling.violation,
         spread_m=spread_m,
         rivals=tuple(c.chance for c in (*ruling.undecided, *ruling.beaten)),
+        is_undecided=bool(ruling.undecided),
     )
 
 

@@ -7,12 +7,14 @@ it: the trust in the fit itself, a logistic function of the evidence.
 
     P = trust / (1 + sum over rivals of min(1, 2 p)^rival_power)
     logit(trust) = constant + a ln(sharpness) + b explained - c violation - d ln(spread / 50 mm)
+                   - e [a rival is undecided]
 
-a, b, c, d and `rival_power` are not negative, so more evidence never makes a pose less probable.
-Their values are expected ones and not yet fitted: the probability orders poses, and is not
-calibrated. ``benchmarks/fit_probability.py`` fits them on generated pairs with known answers;
-``dougong evaluate probability`` measures on other seeds, and on kinds of building that the fit has
-not seen, how often a pose is right at each declared probability.
+a..e and `rival_power` are not negative, so more evidence never makes a pose less probable. e is
+there because a plain building fits other plain buildings too: where several poses of it are
+alike, more often none of them is true. ``benchmarks/fit_probability.py`` fits the coefficients on
+generated pairs with known answers; ``dougong evaluate probability`` measures on other seeds, and
+on kinds of building that the fit has not seen, how often a pose is right at each declared
+probability.
 """
 
 from __future__ import annotations
@@ -40,6 +42,8 @@ class Evidence:
     """How closely the blocks hold the pose, see `covariance.displacement95`; inf: unknown."""
     rivals: tuple[float, ...]
     """The blocks' p-value against each rival pose; 1: as good as the winner."""
+    is_undecided: bool
+    """The verdict could not tell every rival from the pose."""
 
     def terms(self) -> tuple[float, ...]:
         """Return what each coefficient of the trust is multiplied with.
@@ -53,6 +57,7 @@ class Evidence:
             float(np.clip(self.explained, 0.0, 1.0)),
             -float(np.clip(self.violation, 0.0, 0.2)),
             -float(np.log(spread / _SPREAD_M)),
+            -float(self.is_undecided),
         )
 
 
@@ -61,7 +66,7 @@ class Belief:
     """The coefficients of the probability."""
 
     trust: tuple[float, ...]
-    """Constant, ln(sharpness), explained, violation, ln(spread); see `Evidence.terms`."""
+    """Constant, ln(sharpness), explained, violation, ln(spread), undecided; `Evidence.terms`."""
     rival_power: float
 
     def probability(self, evidence: Evidence) -> float:
@@ -77,5 +82,5 @@ def shares(p_values: Sequence[float], power: float) -> float:
     return float(np.sum(doubt**power))
 
 
-BELIEF = Belief(trust=(0.0, 1.0, 2.0, 10.0, 0.5), rival_power=0.5)
-"""What is expected before any fit; some thousand pairs are to replace it."""
+BELIEF = Belief(trust=(0.484, 0.0, 5.643, 13.301, 1.910, 5.060), rival_power=1.828)
+"""Fitted on the pairs of `trial_pairs.TRAINED`, seeds 0-179 and 100000-100126."""

@@ -23,7 +23,7 @@ from dougong.evaluation.trial_pairs import KINDS, TRAINED
 from dougong.pipeline.progress import Progress
 from dougong.registration.probability import BELIEF
 
-FIRST_SEED = 100_000
+FIRST_SEED = 100_130
 """Seeds below are the fit's."""
 RUNS, QUICK_RUNS = 500, 2
 GROUPS = ("known kinds", "new kinds", "all", "all with a pose")
