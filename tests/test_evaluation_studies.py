@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from dougong.cli import call
-from dougong.evaluation import building_runs, coarse_trials
+from dougong.evaluation import building_runs, coarse_trials, registration_peers
 from dougong.evaluation.metrics import pose_errors
 from dougong.evaluation.scenes import make_scene
-from dougong.evaluation.studies import Setting, buildings, coarse, filtering, growth, storage
+from dougong.evaluation.studies import Setting, buildings, coarse, filtering, growth, peers, storage
 from dougong.evaluation.studies.coarse_figure import draw_coarse
 from dougong.evaluation.tabulate import as_text, spread
 
@@ -173,3 +173,49 @@ def test_the_check_error_of_growth_is_the_poses_own(scene, tmp_path):
     assert (line["n"], line["ok"], line["points"], line["check_rmse_mm"]) == (2, 2, 10, 2.0)
     growth.draw_growth([line], tmp_path / "x.png")
     assert (tmp_path / "x.png").stat().st_size > 5000
+
+
+def test_peers_start_5_degrees_and_half_a_metre_off(scene):
+    start = peers.start_of(scene.truth, 0)
+    errors = pose_errors(start, scene.truth)
+    assert errors.rotation_error_deg == pytest.approx(5.0, abs=1e-6)
+    assert np.linalg.norm(errors.translation_at_centroid_m) == pytest.approx(0.5, abs=1e-4)
+
+
+def test_an_answer_is_judged_by_the_truth_and_by_whether_it_is_doubted(scene, tmp_path):
+    trial = peers.plain(peers.base_of(scene), np.random.default_rng(0))
+
+    def fake(name, run):
+        return registration_peers.Peer(
+            name=name, package="numpy", task="find", settings="none", run=run
+        )
+
+    def broken(*_):
+        raise RuntimeError("no way")
+
+    best, start = trial.truth.T_best, peers.start_of(trial.truth, 0)
+    asked = {
+        "right": lambda *_: registration_peers.Answer(best, ""),
+        "flipped": lambda *_: registration_peers.Answer(start, ""),
+        "careful": lambda *_: registration_peers.Answer(start, "not valid"),
+        "broken": broken,
+    }
+    rows = [
+        {"task": "find", "program": name, "building": "hall", "seed": 0}
+        | peers.asked(fake(name, run), trial, 0)
+        for name, run in asked.items()
+    ]
+    table = {line["program"]: line for line in peers.summary(rows)}
+    assert [table[name]["correct"] for name in asked] == [1, 0, 0, 0]
+    assert [table[name]["said_wrongly"] for name in asked] == [0, 1, 0, 0]
+    assert rows[-1]["failed"] == "RuntimeError: no way"
+    assert set(peers._missing(fake("absent", broken))) == set(table["right"])
+    peers.draw_peers(rows, tmp_path / "x.png")
+    assert (tmp_path / "x.png").stat().st_size > 5000
+
+
+def test_a_matrix_is_read_from_text():
+    text = " ".join(f"{value:.3e}" for value in range(16)) + "\n"
+    np.testing.assert_array_equal(registration_peers._matrix(text), np.arange(16.0).reshape(4, 4))
+    with pytest.raises(registration_peers.PeerFailedError, match="no matrix"):
+        registration_peers._matrix("1 2 3")

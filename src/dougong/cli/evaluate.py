@@ -20,6 +20,7 @@ def command(
         "storage",
         "coarse",
         "growth",
+        "peers",
     ],
     /,
     *,
@@ -45,7 +46,8 @@ def command(
         buildings: five kinds of building through the whole program, against the truth.
         filtering: octree depth and cloth threshold, and what each costs. storage: bytes before
         and after, by format. coarse: coarse methods, precision, recall and convergence.
-        growth: errors, seconds and memory against the number of points.
+        growth: errors, seconds and memory against the number of points. peers: the same pairs
+        through other programs, as far as they are installed.
     out
         Folder for the files; default: dougong-STUDY in the current folder.
     quick

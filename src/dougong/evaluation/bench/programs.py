@@ -41,7 +41,8 @@ def is_installed(program: str) -> bool:
     return shutil.which(program) is not None
 
 
-def _write_ply(path: Path, points: NDArray[np.float64]) -> None:
+def write_ply(path: Path, points: NDArray[np.float64]) -> None:
+    """Write points as a binary PLY file of doubles, which both programs read."""
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
         "property double x\nproperty double y\nproperty double z\nend_header\n"
@@ -80,7 +81,7 @@ def _less_reading(work: Sequence[str], reading: Sequence[str], threads: int) -> 
 def _pdal(arrays: Arrays, threads: int, stage: dict[str, Any]) -> Cost:
     with tempfile.TemporaryDirectory() as folder:
         cloud = Path(folder) / "cloud.ply"
-        _write_ply(cloud, arrays["points"])
+        write_ply(cloud, arrays["points"])
         commands = []
         for name, stages in (("work", [stage]), ("read", [])):
             file = Path(folder) / f"{name}.json"
@@ -134,6 +135,6 @@ def cloudcompare_sor(arrays: Arrays, threads: int) -> Cost:
     """Remove statistical outliers."""
     with tempfile.TemporaryDirectory() as folder:
         cloud = Path(folder) / "cloud.ply"
-        _write_ply(cloud, arrays["points"])
+        write_ply(cloud, arrays["points"])
         reading = ["CloudCompare", "-SILENT", "-AUTO_SAVE", "OFF", "-O", str(cloud)]
         return _less_reading([*reading, "-SOR", str(NEIGHBOURS), str(SIGMAS)], reading, threads)

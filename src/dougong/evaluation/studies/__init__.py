@@ -33,6 +33,7 @@ STUDIES: Mapping[str, str] = {
     "storage": "bytes on disk before and after, by format",
     "coarse": "coarse methods: precision, recall, convergence",
     "growth": "errors, seconds and memory against the number of points",
+    "peers": "the same pairs through other programs",
 }
 """Every study by its name, with what it measures."""
 
