@@ -194,7 +194,7 @@ def _document(name: str, setting: Setting, found: Findings) -> dict[str, Any]:
         "runs": setting.runs,
         "is_quick": setting.is_quick,
         "points": setting.points,
-        "data": None if setting.data is None else str(setting.data),
+        "data": None if setting.data is None else setting.data.name,
         "table": [dict(row) for row in found.table],
     }
 

@@ -34,6 +34,8 @@ FIGURES = {
     "total_s": 1,
 }
 """Columns whose median and range are told, with their digits."""
+SHOWN_MM = (0.1, 200.0)
+"""What the figure shows; no bending is below it, a wrong pose beyond it."""
 COLUMNS = {
     "pair": "pair",
     "building": "building",
@@ -120,7 +122,7 @@ def draw_errors(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     pairs = [pair for (pair,) in distinct(rows, "pair")]
     figure = new_figure(4.6 * len(pairs) + 0.8, 4.0)
     panels = figure.subplots(1, len(pairs), sharey=True, squeeze=False)[0]
-    ticks = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
+    ticks = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
     told = {
         "pose95_mm": "A: pose",
         "bending_floor95_mm": "B: bending alone",
@@ -131,19 +133,28 @@ def draw_errors(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         group = chosen(rows, pair=pair)
         kinds = [kind for (kind,) in distinct(group, "building")]
         for number, (key, label) in enumerate(told.items()):
-            shown = [row for row in group if row.get(key)]
-            at = [kinds.index(row["building"]) + 0.18 * (number - 1.5) for row in shown]
-            values = [row[key] for row in shown]
-            panel.scatter(at, values, s=26, color=f"C{number}", label=label, zorder=3)
+            colour = f"C{number}"
+            for row in group:
+                value = row.get(key)
+                if value is None or value < SHOWN_MM[0]:
+                    continue
+                at = kinds.index(row["building"]) + 0.18 * (number - 1.5)
+                # Off the scale: an arrow at its edge.
+                marker = "^" if value > SHOWN_MM[1] else "o"
+                face = colour if row["status"] == "ok" else "none"
+                style = {"marker": marker, "facecolors": face, "edgecolors": colour}
+                panel.scatter(at, min(value, SHOWN_MM[1]), s=26, zorder=3, **style)
+            panel.scatter([], [], s=26, color=colour, label=label)
         for level, edge in (("LOA40", 5.0), ("LOA30", 15.0), ("LOA20", 50.0)):
             panel.axhline(edge, color="0.75", linewidth=0.8)
             panel.annotate(level, (len(kinds) - 0.5, edge), fontsize=7, color="0.4", ha="right")
         panel.set_xticks(range(len(kinds)), kinds)
         panel.set_xlim(-0.5, len(kinds) - 0.5)
         panel.set_yscale("log")
+        panel.set_ylim(SHOWN_MM[0], 1.15 * SHOWN_MM[1])
         panel.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
         panel.set_title(pair, fontsize=10)
-    panels[0].set_ylabel("95 % error, mm")
+    panels[0].set_ylabel("95 % error, mm (hollow: ambiguous)")
     handles, labels = panels[0].get_legend_handles_labels()
     across = 2 if len(pairs) == 1 else 4
     figure.legend(handles, labels, loc="outside upper center", ncols=across, fontsize=9)
