@@ -1,6 +1,9 @@
 """A run whose clouds do not fit in memory: the same files as one whose clouds do."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,16 @@ from dougong.registration.result import Registration
 from dougong.threads import get_threads, set_threads
 
 SHIFT = np.array([3.0, -2.0, 0.5])
+SMALL = {
+    "BASE_BYTES": 0,
+    "BYTES_PER_POINT": 30,
+    "BYTES_PER_WAITING_POINT": 10,
+    "BYTES_PER_REDUCED_POINT": 2,
+    "LEAST_TILE_POINTS": 100,
+    "_BYTES_PER_BOOKED_POINT": 1,
+    "_BYTES_PER_TILE_POINT": 40,
+}
+"""Estimates by which 15,000 points do not fit in 190 kB, and tiles of them do."""
 ROOMS = {"whole": "4GB", "few": "500kB", "many": "190kB"}
 
 
@@ -46,9 +59,7 @@ def folder(tmp_path, monkeypatch):
 
     monkeypatch.setattr("dougong.pipeline.links.register", register)
     monkeypatch.setattr("dougong.app._build_report", lambda *_: None)
-    for name, value in (("BASE_BYTES", 0), ("BYTES_PER_POINT", 30), ("LEAST_TILE_POINTS", 100),
-                        ("BYTES_PER_WAITING_POINT", 10), ("_BYTES_PER_BOOKED_POINT", 1),
-                        ("_BYTES_PER_TILE_POINT", 40), ("BYTES_PER_REDUCED_POINT", 2)):  # fmt: skip
+    for name, value in SMALL.items():
         monkeypatch.setattr(memory, name, value)
     monkeypatch.setattr(reduced, "MOST_POINTS", 6000)
     monkeypatch.setattr(reduced, "LEAST_POINTS", 6000)
@@ -64,12 +75,16 @@ def write(folder, order=None):
         dougong.write(Cloud.from_points(points[turn]), folder / f"{name}.laz", overwrite=True)
 
 
-def run(folder, name, room, *options):
-    out = folder / name
-    tokens = ["--lidar", folder / "scan.laz", "--photogrammetry", folder / "map.laz", "--quiet"]
-    tokens += ["--out", out, "--memory", room, *options]
-    assert call(["run", *map(str, tokens)]) == 0
-    return json.loads((out / "result.json").read_text())
+def tokens_of(folder, name, room, *options, kinds=("lidar", "photogrammetry")):
+    files = {"lidar": folder / "scan.laz", "photogrammetry": folder / "map.laz"}
+    named = [text for kind in kinds for text in (f"--{kind}", str(files[kind]))]
+    out = str(folder / name)
+    return ["run", *named, "--out", out, "--memory", room, "--quiet", *options]
+
+
+def run(folder, name, room, *options, **more):
+    assert call(tokens_of(folder, name, room, *options, **more)) == 0
+    return json.loads((folder / name / "result.json").read_text())
 
 
 def comparable(result):
@@ -149,3 +164,47 @@ def test_records_in_parts_are_sorted_as_a_whole(tmp_path, most):
     whole = np.sort(records.view(f"V{records.dtype.itemsize}"))
     assert found.tobytes() == whole.tobytes()
     assert not list(tmp_path.rglob("sort-*"))
+
+
+KILLED = """
+import json, os, sys
+from dougong import app
+from dougong.cli import call
+from dougong.pipeline import memory, spooling, writing
+
+for name, value in json.loads(sys.argv[1]).items():
+    setattr(memory, name, value)
+app._build_report = lambda *_: None
+
+
+def run(module, name, calls):
+    # A child that is killed when it calls a function for the nth time: nothing is tidied up.
+    child = os.fork()
+    if child == 0:
+        known, left = getattr(module, name), [calls]
+
+        def counted(*args, **more):
+            left[0] -= 1
+            if left[0] < 0:
+                os.kill(os.getpid(), 9)
+            return known(*args, **more)
+
+        setattr(module, name, counted)
+        os._exit(call(sys.argv[2:]))
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+codes = [run(spooling, "removed_sample", 0), run(writing, "choose", 0), run(writing, "choose", 9)]
+sys.exit(0 if codes == [-9, -9, 0] else f"ended with {codes}")
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_killed_run_ends_as_one_left_alone(folder):
+    run(folder, "calm", ROOMS["whole"], kinds=("lidar",))
+    rooms = {name: getattr(memory, name) for name in SMALL}
+    tokens = tokens_of(folder, "killed", ROOMS["many"], kinds=("lidar",))
+    subprocess.run([sys.executable, "-c", KILLED, json.dumps(rooms), *tokens], check=True)
+    assert bytes_of(folder / "killed") == bytes_of(folder / "calm")
+    left = {path.name for path in folder.iterdir()}
+    assert left == {"calm", "killed", "scan.laz", "map.laz"}
