@@ -197,7 +197,7 @@ def _told(document: dict[str, Any]) -> dict[str, Any]:
     """Return what the program itself says of its work: seconds, points by stage, what it found."""
     clouds = document.get("clouds", [document])
     stages = [stage for cloud in clouds for stage in cloud["stages"]]
-    names = ("seconds", "status", "merged", "result_hash")
+    names = ("seconds", "cpu_seconds", "status", "merged", "result_hash")
     return {"stages": stages, **{name: document[name] for name in names if name in document}}
 
 

@@ -21,8 +21,9 @@ def as_points(value: ArrayLike, name: str = "points") -> Points:
             f"{name} must have shape (n, 3), got {points.shape}. Keep x, y, z only: points[:, :3]."
         )
         raise InputError(msg)
-    is_bad = ~np.isfinite(points).all(axis=1)
-    if is_bad.any():
+    is_finite = np.isfinite(points)
+    if not is_finite.all():
+        is_bad = ~is_finite.all(axis=1)
         msg = (
             f"{name} has {is_bad.sum()} of {len(points)} rows that are not finite "
             f"(first: row {np.flatnonzero(is_bad)[0]}). "

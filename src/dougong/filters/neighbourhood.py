@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dougong._boxes import corners_of
 from dougong._checks import as_points
 from dougong.errors import InputError
 from dougong.kernels import boxtree, moments, neighbours, order
@@ -59,8 +60,8 @@ def spatial_order(points: Points) -> Index:
     places = np.arange(n, dtype=np.int64)
     if n < 2:
         return places
-    low = points.min(axis=0)
-    edge = max(float((points.max(axis=0) - low).max()), 1e-9)
+    low, high = corners_of(points)
+    edge = max(float((high - low).max()), 1e-9)
     keys = np.empty(n, np.uint64)
     for_blocks(
         n,

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._boxes import are_within
 from dougong.filters.octree_voxel_grid import Root
 from dougong.threads import for_blocks
 from dougong.typing import Blocks, Points
@@ -32,7 +33,7 @@ def _keys(points: Points, root: Root, level: int) -> NDArray[np.uint64]:
     """Return the nodes that hold points, each once."""
     from dougong.kernels import order
 
-    is_inside = ((points >= root.low) & (points <= root.low + root.edge_m)).all(axis=1)
+    is_inside = are_within(points, root.low, root.low + root.edge_m)
     inside = np.ascontiguousarray(points if is_inside.all() else points[is_inside])
     keys = np.empty(len(inside), np.uint64)
     cell_m = root.edge_m / 2.0**level

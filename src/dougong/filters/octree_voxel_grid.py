@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
+from dougong._boxes import are_within, corners_of
 from dougong._checks import as_points
 from dougong.errors import InputError
 from dougong.filters.selection import Selection
@@ -104,10 +105,10 @@ def _corners(
     for block in blocks():
         points = block
         if within is not None:
-            points = block[((block >= within[0]) & (block <= within[1])).all(axis=1)]
+            points = block[are_within(block, *within)]
         if len(points):
-            low = np.minimum(low, points.min(axis=0))
-            high = np.maximum(high, points.max(axis=0))
+            lowest, highest = corners_of(points)
+            low, high = np.minimum(low, lowest), np.maximum(high, highest)
     return low, high
 
 
@@ -226,9 +227,10 @@ def _runs(xyz: Points, low: NDArray[np.float64], voxel_m: float) -> tuple[Index,
 
     n = len(xyz)
     top = float(1 << order.KEY_BITS)
-    span = (xyz.max(axis=0) - low) / voxel_m
+    lowest, highest = corners_of(xyz)
+    span = (highest - low) / voxel_m
     is_inside: Mask = np.ones(n, bool)
-    if span.max() >= top or (xyz.min(axis=0) < low).any():
+    if span.max() >= top or (lowest < low).any():
         cells = np.floor((xyz - low) / voxel_m)
         is_inside = np.asarray(((cells >= 0) & (cells < top)).all(axis=1))
     places = np.flatnonzero(is_inside)

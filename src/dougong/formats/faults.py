@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._boxes import are_within
 from dougong.cloud import Cloud, Frame
 from dougong.typing import Points
 
@@ -137,6 +138,4 @@ def faults_in_words(
 
 def points_beyond(xyz: Points, low: Any, high: Any) -> int:
     """Return how many points lie outside a box."""
-    if (xyz.min(axis=0) >= low).all() and (xyz.max(axis=0) <= high).all():
-        return 0
-    return int(((xyz < low) | (xyz > high)).any(axis=1).sum())
+    return len(xyz) - int(np.count_nonzero(are_within(xyz, low, high)))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._boxes import corners_of
 from dougong.cloud import Cloud, Pieces, Records
 from dougong.errors import InputError
 from dougong.formats.las import waveform_channels
@@ -68,8 +69,9 @@ class _Survey:
             self.steps[1] = np.maximum(self.steps[1], highest)
             return
         there = piece.frame.to_file(piece.xyz)
-        self.box[0] = np.minimum(self.box[0], there.min(axis=0))
-        self.box[1] = np.maximum(self.box[1], there.max(axis=0))
+        low, high = corners_of(there)
+        self.box[0] = np.minimum(self.box[0], low)
+        self.box[1] = np.maximum(self.box[1], high)
 
 
 def _keeps_integers(piece: Cloud) -> bool:

@@ -64,20 +64,24 @@ def kernels_are_compiled() -> bool:
 
 
 class Clock:
-    """Seconds per named stage, summed where a name comes back."""
+    """Seconds per named stage, summed where a name comes back: of the wall and of the processor."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self.cpu_seconds: dict[str, float] = {}
+        """Of all threads of this process."""
         self._start = time.perf_counter()
 
     @contextmanager
     def measure(self, name: str) -> Iterator[None]:
         """Add the seconds of the ``with`` block to `name`."""
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), time.process_time()
         try:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            spent = time.process_time() - cpu
+            self.cpu_seconds[name] = self.cpu_seconds.get(name, 0.0) + spent
 
     def total(self) -> float:
         """Return the seconds since the clock was made."""

@@ -131,6 +131,7 @@ def _result(project: Project, loader: Loader, out: Path) -> dict[str, Any]:
         "merged": merged,
         "full_resolution": full,
         "seconds": {**clock.seconds, "total": clock.total()},
+        "cpu_seconds": dict(clock.cpu_seconds),
         "peak_memory_bytes": peak_memory_bytes(),
         "finished_utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "result_hash": digest,

@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from dougong._boxes import are_within, corners_of
 from dougong.cloud import Cloud, Frame
 from dougong.tiles.cloud import (
     POINTS,
@@ -23,7 +24,7 @@ from dougong.tiles.cloud import (
 )
 from dougong.tiles.grid import grid_for
 from dougong.tiles.spool import Spool
-from dougong.typing import Index, Mask, Points
+from dougong.typing import Index, Points
 
 HALO_SHARE = 3
 """A tile holds at most this share of the points that fit: the others are for its halo."""
@@ -77,6 +78,8 @@ def cut(sets: tuple[Iterable[Points], Iterable[Points]], folder: Path, most: int
     def clouds() -> Iterator[Cloud]:
         for side, pieces in enumerate(sets):
             for xyz in pieces:
+                if not len(xyz):
+                    continue
                 records = np.empty(len(xyz), dtype=[("side", "u1"), ("row", "<i8")])
                 records["side"] = side
                 records["row"] = np.arange(counts[side], counts[side] + len(xyz))
@@ -86,7 +89,8 @@ def cut(sets: tuple[Iterable[Points], Iterable[Points]], folder: Path, most: int
     spool = Spool(clouds(), folder)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for block in spool.blocks():
-        low, high = np.minimum(low, block.min(axis=0)), np.maximum(high, block.max(axis=0))
+        lowest, highest = corners_of(block)
+        low, high = np.minimum(low, lowest), np.maximum(high, highest)
     grid = grid_for(low, float((high - low).max()), _STEP_M, spool.points, most)
     tiles: list[Tile] = []
     for file in spool.cut(grid, most):
@@ -108,14 +112,9 @@ def _sides(cloud: TiledCloud, tile: Tile, halo_m: float) -> Sides:
     rows = (held["row"][held["side"] == 0], held["row"][held["side"] == 1])
     for other in cloud.near(tile, halo_m) if halo_m > 0 else ():
         more = read_arrays(cloud.folder, other, POINTS, "xyz", "side")
-        is_near = _near(more["xyz"], tile, halo_m)
+        wider = np.array(tile.low) - halo_m, np.array(tile.high) + halo_m
+        is_near = are_within(more["xyz"], *wider)
         for side in (0, 1):
             points[side].append(more["xyz"][is_near & (more["side"] == side)])
     one, two = (np.ascontiguousarray(np.concatenate(parts)) for parts in points)
     return Sides((one, two), rows)
-
-
-def _near(xyz: Points, tile: Tile, halo_m: float) -> Mask:
-    is_in = (xyz >= np.array(tile.low) - halo_m) & (xyz <= np.array(tile.high) + halo_m)
-    near: Mask = np.asarray(is_in.all(axis=1))
-    return near

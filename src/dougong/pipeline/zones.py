@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._boxes import corners_of
 from dougong.typing import Index, Mask, Points, Values
 
 _LATTICE_M = 1e-4
@@ -53,8 +54,8 @@ def grid_over(sets: Iterable[Points], edge_m: float) -> Grid:
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for points in sets:
         if len(points):
-            low = np.minimum(low, points.min(axis=0))
-            high = np.maximum(high, points.max(axis=0))
+            lowest, highest = corners_of(points)
+            low, high = np.minimum(low, lowest), np.maximum(high, highest)
     size = np.floor((high - low) / edge_m).astype(np.int64) + 3
     return Grid(low=low - edge_m, size=size, edge_m=edge_m)
 

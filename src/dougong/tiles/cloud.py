@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._boxes import corners_of
 from dougong.errors import OutputError
 from dougong.typing import Points
 
@@ -82,8 +83,8 @@ def load_tiles(folder: Path) -> TiledCloud | None:
 
 def tile_of(name: str, xyz: Points) -> Tile:
     """Return the tile of at least one point."""
-    low, high = xyz.min(axis=0).tolist(), xyz.max(axis=0).tolist()
-    return Tile(name, len(xyz), tuple(low), tuple(high))
+    low, high = corners_of(xyz)
+    return Tile(name, len(xyz), tuple(low.tolist()), tuple(high.tolist()))
 
 
 def path_of(folder: Path, tile: Tile, stage: str) -> Path:

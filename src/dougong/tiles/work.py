@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._boxes import are_within
 from dougong.filters.cloth_simulation import UNKNOWN, Cloth, ClothSimulation, classify
 from dougong.filters.curvature_weighted import (
     CurvatureWeighted,
@@ -128,9 +129,7 @@ def _with_halo(job: Job, halo_m: float) -> Part:
 
 
 def _in_box(xyz: Points, tile: Tile, wider_m: float) -> Mask:
-    is_in = (xyz >= np.array(tile.low) - wider_m) & (xyz <= np.array(tile.high) + wider_m)
-    inside: Mask = np.logical_and.reduce(is_in, axis=1)
-    return inside
+    return are_within(xyz, np.array(tile.low) - wider_m, np.array(tile.high) + wider_m)
 
 
 def _own(selection: Selection, own: int) -> Selection:
