@@ -65,10 +65,10 @@ def states(bench, points):
 
 
 @pytest.mark.parametrize(("name", "values"), JOBS)
-@pytest.mark.parametrize("most", [700, 10**9])
+@pytest.mark.parametrize("most", [500, 10**9])
 def test_tiles_judge_as_the_whole(tmp_path, name, values, most):
     spec = FILTERS[name]
-    cloud, whole = tiled(site(0), tmp_path, most)
+    cloud, whole = tiled(site(0, 1500), tmp_path, most)
     assert (len(cloud.tiles) > 8) == (most < 1000)
     params = spec.params(**values)
     expected = spec.verb(whole.xyz, params)
