@@ -5,15 +5,23 @@ from pathlib import Path
 
 import dougong
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
 project = "dougong"
 author = "The dougong authors"
 project_copyright = author
 version = release = dougong.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns: list[str] = []
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "from_code",
+]
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+napoleon_numpy_docstring = True
+exclude_patterns = ["_ext", "evidence/README.md"]
 source_suffix = {".md": "markdown"}
 highlight_language = "text"  # indented blocks are files and output, not programs
 
