@@ -246,7 +246,7 @@ def test_a_failing_job_leaves_nothing(folder, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("tokens", "said"),
     [
-        (("--lidar", "gone.laz"), "no file matches"),
+        (("--lidar", "gone.laz"), "there is no file"),
         ((), "no cloud is named"),
         (("project.toml", "--lidar", "one.laz"), "Pass one or the other"),
         (("--lidar", "one.laz", "--photogrammetry", "one.laz"), "two clouds are called 'one'"),

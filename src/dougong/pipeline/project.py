@@ -206,10 +206,12 @@ def files_of(entry: Entry, folder: Path) -> list[Path]:
         matches = [exact] if exact.is_file() else sorted(base.glob(pattern))
         matches = [match for match in matches if match.is_file()]
         if not matches:
-            msg = (
-                f"cloud {entry.name!r}: no file matches {text!r} in {base}. "
-                "Paths are relative to the project file."
-            )
+            msg = f"cloud {entry.name!r}: there is no file {text}."
+            if not path.is_absolute():
+                msg = (
+                    f"cloud {entry.name!r}: no file matches {text!r} in {base}. "
+                    "Paths are relative to the project file."
+                )
             raise InputError(msg)
         found += [match for match in matches if match not in found]
     return found
