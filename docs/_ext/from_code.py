@@ -233,10 +233,11 @@ def _provenance(study: str, document: dict[str, Any]) -> Iterator[str]:
     machine = document.get("machine", {})
     software = document.get("software", {})
     seeds = document.get("seeds") or []
+    measured = document.get("measurements") or len(document.get("rows", document["table"]))
     facts = [
         f"`dougong evaluate {study}`",
         f"dougong {software.get('dougong', '?')}",
-        f"{len(document.get('rows', document['table']))} measurements",
+        f"{measured:,} measurements",
         document.get("measured_against", ""),
         f"{len(seeds)} seed{'s' * (len(seeds) > 1)}" if seeds else "",
         ", ".join(str(machine[key]) for key in ("processor", "cpu", "system") if key in machine),
