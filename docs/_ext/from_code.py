@@ -220,13 +220,19 @@ class Evidence(Written):
         yield from _provenance(study, document)
         if path.with_suffix(".png").is_file():
             yield from (f"![{study}](evidence/{study}.png)", "")
-        rows = document["table"]
+        rows, note = _shown_rows(document["table"])
         columns = list(dict.fromkeys(key for row in rows for key in row))
-        cells = [[_cell(row.get(key)) for key in columns] for row in rows[:MOST_ROWS]]
+        cells = [[_cell(row.get(key)) for key in columns] for row in rows]
         yield from table([column.replace("_", " ") for column in columns], cells)
-        if len(rows) > MOST_ROWS:
-            yield f"The first {MOST_ROWS} of {len(rows)} rows."
-            yield ""
+        yield from (note, "") if note else ()
+
+
+def _shown_rows(rows: Sequence[dict[str, Any]]) -> tuple[Sequence[dict[str, Any]], str]:
+    """Return the rows that fit on a page, and what was left out: the summaries go first."""
+    if len(rows) <= MOST_ROWS:
+        return rows, ""
+    whole = [row for row in rows if "all" in row.values()] or list(rows)
+    return whole[:MOST_ROWS], f"{len(whole[:MOST_ROWS])} of {len(rows)} rows; the file has all."
 
 
 def _provenance(study: str, document: dict[str, Any]) -> Iterator[str]:
