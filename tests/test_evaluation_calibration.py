@@ -8,6 +8,7 @@ from dougong.evaluation.calibration import (
     SETTINGS,
     area_under_roc,
     calibration_error,
+    error_by_chance,
     fit,
     measure,
     reliability,
@@ -125,6 +126,8 @@ def test_measures_of_calibration_against_their_definitions():
     p = rng.random(20_000)
     is_correct = rng.random(20_000) < p
     assert calibration_error(p, is_correct) < 0.02
+    # Few pairs show an error where there is none.
+    assert error_by_chance(p[:100]) > 0.05 > error_by_chance(p) > 0.0
     # Declared 0.2 too high, where there is room for it.
     assert calibration_error(np.minimum(p + 0.2, 1.0), is_correct) == pytest.approx(0.18, abs=0.02)
     expected = stats.mannwhitneyu(p[is_correct], p[~is_correct]).statistic

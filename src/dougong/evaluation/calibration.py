@@ -19,7 +19,7 @@ from dougong.registration.plan_search import PlanSearch, plan_search
 from dougong.registration.prepare import Prepare, prepare
 from dougong.registration.probability import MOST_PROBABLE, Belief, Evidence, shares
 from dougong.registration.settings import Register
-from dougong.typing import Mask, Values
+from dougong.typing import Index, Mask, Values
 
 Row = Mapping[str, Any]
 SETTINGS = Register(
@@ -122,11 +122,24 @@ def calibration_error(p: Values, is_correct: Mask, bins: int = BINS) -> float:
 
     In `bins` equal steps of the declared probability.
     """
+    place = _bin_of(p, bins)
+    off = np.bincount(place, p - is_correct, bins)
+    return float(np.abs(off).sum() / max(len(p), 1))
+
+
+def _bin_of(p: Values, bins: int) -> Index:
+    place: Index = np.minimum((p * bins).astype(np.int64), bins - 1)
+    return place
+
+
+def error_by_chance(p: Values, bins: int = BINS, draws: int = 200) -> float:
+    """Return the calibration error that so many pairs show on average where `p` is exact.
+
+    It falls with the number of pairs; a measured error near it is no sign of a wrong probability.
+    """
+    rng = np.random.default_rng(0)
     return float(
-        sum(
-            b["share"] * abs(b["declared"] - b["observed"])
-            for b in reliability(p, is_correct, bins)
-        )
+        np.mean([calibration_error(p, rng.random(len(p)) < p, bins) for _ in range(draws)])
     )
 
 
@@ -135,7 +148,7 @@ def reliability(p: Values, is_correct: Mask, bins: int = BINS) -> list[dict[str,
 
     With the 95 % interval of the observed one (Clopper and Pearson 1934).
     """
-    place = np.minimum((p * bins).astype(np.int64), bins - 1)
+    place = _bin_of(p, bins)
     table = []
     for k in np.unique(place):
         chosen = is_correct[place == k]

@@ -14,6 +14,7 @@ from dougong.evaluation.calibration import (
     BINS,
     area_under_roc,
     calibration_error,
+    error_by_chance,
     measure,
     probabilities,
     reliability,
@@ -69,6 +70,7 @@ def summary(name: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "pairs": len(rows),
         "without_single_answer": sum(not row["is_unique"] for row in rows),
         "calibration_error": round(calibration_error(p, is_correct), 4),
+        "calibration_error_by_chance": round(error_by_chance(p), 4),
         "area_under_roc": round(area_under_roc(p, is_correct), 4),
         "ok": count,
         "wrong": len(wrong),
@@ -83,15 +85,17 @@ def text(table: Sequence[Mapping[str, Any]]) -> str:
     """Return the table for a terminal."""
     lines = [
         "Right: within 50 mm (TRE95). Expected calibration error in "
-        f"{BINS} bins; ROC: a right pose declared more probable than a wrong one.",
+        f"{BINS} bins, and what so few pairs show by chance where every probability is exact;",
+        "ROC: a right pose declared more probable than a wrong one.",
         "",
-        f"{'':18}{'pairs':>7}{'no single answer':>18}{'calibration':>13}{'ROC area':>10}"
-        f"{'ok':>6}{'wrong':>7}{'ambiguous':>11}{'failed':>8}",
+        f"{'':18}{'pairs':>7}{'no single answer':>18}{'calibration':>13}{'by chance':>11}"
+        f"{'ROC area':>10}{'ok':>6}{'wrong':>7}{'ambiguous':>11}{'failed':>8}",
     ]
     for row in table:
         none = row["without_single_answer"] / row["pairs"]
         lines.append(
             f"{row['group']:18}{row['pairs']:>7}{none:>17.0%} {row['calibration_error']:>13.3f}"
+            f"{row['calibration_error_by_chance']:>11.3f}"
             f"{row['area_under_roc']:>10.3f}{row['ok']:>6}{row['wrong']:>7}{row['ambiguous']:>11}"
             f"{row['failed']:>8}"
         )
