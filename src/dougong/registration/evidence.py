@@ -40,6 +40,9 @@ _FACING_COSINE = 0.5
 # whether it is held at all is what `covariance.unobservable` says.
 _LEAST_FACING = 0.02
 _VIOLATION = 1.5
+# Of so many neighbours more than half must lie within about 26 degrees of the same plane.
+_NEIGHBOURS = 12
+_FIRM_COSINE = 0.9
 # No roof or floor is thicker: what lies deeper below a top is not its underside.
 _THICKEST_M = 0.4
 _ABOVE_TOP_M = 0.75
@@ -86,6 +89,8 @@ class Witness:
     """(n,) square metres, flat ones more, ground a tenth: flat ground agrees with any pose."""
     is_structure: Mask
     """(n,) flat and standing above the ground."""
+    is_firm: Mask
+    """(n,) of a surface that goes on: leaves may be flat too, but not as those beside them are."""
     everything: Rung
     slack: Values
     """Half-distance between neighbours of `everything`: what a gap between points may add."""
@@ -158,12 +163,24 @@ def _witness(prepared: Prepared) -> Witness:
         may_be_underside=everything.may_be_underside[everything.asked],
         weights=area * np.square(planarity) * np.where(is_ground, _GROUND_SHARE, 1.0),
         is_structure=(planarity > 0.7) & ~is_ground,
+        is_firm=_goes_on(everything),
         everything=everything,
         slack=0.75 * np.sqrt(prepared.weights_area[everything.index]),
         plan=_plan(prepared),
         sees_tops=prepared.kind == "photogrammetry",
         free=_free_space(prepared, everything),
     )
+
+
+def _goes_on(everything: Rung) -> Mask:
+    """Say of which heard points the nearest neighbours' planes lie as theirs do."""
+    asked = everything.asked
+    near, _ = neighbourhood.knn(everything.neighbours, everything.xyz[asked], _NEIGHBOURS + 1)
+    own, others = everything.normals[asked], everything.normals[np.maximum(near, 0)]
+    alike = np.abs(np.einsum("ij,ikj->ik", own, others)) > _FIRM_COSINE
+    # The point itself is among them.
+    goes_on: Mask = ((near >= 0) & alike).sum(axis=1) > 1 + _NEIGHBOURS // 2
+    return goes_on
 
 
 def _free_space(prepared: Prepared, everything: Rung) -> FreeSpace | None:
@@ -280,10 +297,11 @@ def support(court: Court, testimony: Testimony) -> float:
 def violation(court: Court, testimony: Testimony) -> float:
     """Return the share of visible structure that stands in the other sensor's free space.
 
-    The larger of both clouds' shares; one of which the other could see next to nothing is not
-    asked.
+    Of surfaces that go on: crowns of trees grow, move, and are lost by photogrammetry. The larger
+    of both clouds' shares; one of which the other could see next to nothing is not asked.
     """
-    weights, split = structure_weights(court), len(court.source.points)
+    is_firm = np.concatenate([court.source.is_firm, court.target.is_firm])
+    weights, split = structure_weights(court) * is_firm, len(court.source.points)
     total, worst = float(weights.sum()), 0.0
     for part in (slice(0, split), slice(split, None)):
         visible = float(weights[part] @ testimony.is_visible[part])
