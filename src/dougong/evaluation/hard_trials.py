@@ -8,13 +8,16 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from dougong.evaluation.mesh import FINE, GROUND, SURFACE
-from dougong.evaluation.metrics import Truth
+from dougong.evaluation.metrics import Truth, fit_rigid
 from dougong.evaluation.scenes import Scene
 from dougong.evaluation.survey import rotation
 
 Points = NDArray[np.float64]
+_SEEN_M = 0.3
+"""Surface this near to a scan's points was seen by it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,13 +91,17 @@ def pose(rng: np.random.Generator, tilt_deg: float = 0.4) -> Points:
 
 
 def truth_of(base: Base, T: Points, inside: Callable[[Points], Any] | None = None) -> Truth:
-    """Return the truth for a source that `T` moved away, judged on the surface `inside`."""
+    """Return the truth for a source that `T` moved away, judged on the surface `inside`.
+
+    The best rigid pose is that of the judged surface: a part is laid on the part as it was bent.
+    """
     chosen = np.ones(len(base.surface), bool) if inside is None else inside(base.surface)
+    surface, bent = moved(T, base.surface[chosen]), base.bent[chosen]
     return Truth(
         T_target_source=inverse(T),
-        T_best=base.T_best @ inverse(T),
-        surface_points=moved(T, base.surface[chosen]),
-        surface_bent=base.bent[chosen],
+        T_best=base.T_best @ inverse(T) if inside is None else fit_rigid(surface, bent),
+        surface_points=surface,
+        surface_bent=bent,
     )
 
 
@@ -145,9 +152,13 @@ def part(base: Base, rng: np.random.Generator) -> Trial:
 
 def one_station(base: Base, rng: np.random.Generator) -> Trial:
     """Take a single station, which sees one facade."""
-    trial = plain(base, rng)
-    first = base.station == base.station[base.station >= 0].min()
-    return replace(trial, source=trial.source[first])
+    first = base.lidar[base.station == base.station[base.station >= 0].min()]
+
+    def seen(x: Points) -> Any:
+        return cKDTree(first).query(x, distance_upper_bound=_SEEN_M)[0] < np.inf
+
+    T = pose(rng)
+    return Trial(source=moved(T, first), target=base.drone, truth=truth_of(base, T, seen))
 
 
 def outliers(base: Base, rng: np.random.Generator) -> Trial:
