@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from dougong.evaluation import studies
 from dougong.evaluation.calibration import (
     SETTINGS,
     area_under_roc,
@@ -119,6 +120,20 @@ def test_a_stopped_study_goes_on_and_makes_no_row_twice(tmp_path):
     rows = measured(setting, keys, row, Silent())
     assert asked == [("l", 0), ("l", 1), ("u", 0), ("u", 0), ("u", 1)]
     assert [line["value"] for line in rows] == [1.5, None, 1.5, None]
+
+
+def test_kept_rows_of_other_source_are_made_again(tmp_path, monkeypatch):
+    setting, asked = Setting(kept=tmp_path / "rows.jsonl"), []
+
+    def row(kind):
+        asked.append(kind)
+        return {"value": len(asked)}
+
+    for code in ("a", "a", "b", "b"):
+        monkeypatch.setattr(studies, "_code", lambda code=code: code)
+        (line,) = measured(setting, [("l",)], row, Silent())
+    assert asked == ["l", "l"]
+    assert line["value"] == 2
 
 
 def test_measures_of_calibration_against_their_definitions():

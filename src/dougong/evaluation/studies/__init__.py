@@ -11,6 +11,7 @@ import json
 import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -89,15 +90,15 @@ def measured(
 ) -> list[Mapping[str, Any]]:
     """Return `measure(*key)` of every key; a row that was kept by a stopped run is not made again.
 
-    Rows are kept one per line, with their key and the program's version, as soon as they are
-    measured. Rows of another version are made again.
+    Rows are kept one per line, with their key, the program's version and the hash of its source,
+    as soon as they are measured. Rows of other source are made again: the document names one.
     """
-    version = software()
+    made_by = {"software": software(), "code": _code()}
     rows: dict[str, Mapping[str, Any]] = {}
     if setting.kept is not None and setting.kept.is_file():
         for text in setting.kept.read_text(encoding="utf-8").splitlines():
             line = _line(text)
-            if line is not None and line["software"] == version:
+            if line is not None and made_by.items() <= line.items():
                 rows[json.dumps(line["key"])] = line["row"]
     chosen = []
     for key in keys:
@@ -106,11 +107,17 @@ def measured(
             progress.stage(", ".join(str(part) for part in key))
             rows[name] = finite(dict(measure(*key)))
             if setting.kept is not None:
-                line = {"key": key, "software": version, "row": rows[name]}
+                line = {"key": key, **made_by, "row": rows[name]}
                 with setting.kept.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(line) + "\n")
         chosen.append(rows[name])
     return chosen
+
+
+@cache
+def _code() -> str:
+    """Return the hash of our source as it is when a study begins, not when it has ended."""
+    return code_hash(_ROOMS)
 
 
 def _line(text: str) -> dict[str, Any] | None:
@@ -156,6 +163,7 @@ def evaluate(
     if overwrite:
         kept.unlink(missing_ok=True)
     setting = replace(setting, kept=kept)
+    _code()
     # Without what draws the figure a study would fail after hours of work.
     new_figure(1.0, 1.0)
     found: Findings = import_module(f"dougong.evaluation.studies.{name}").study(setting, progress)
@@ -187,7 +195,7 @@ def _document(name: str, setting: Setting, found: Findings) -> dict[str, Any]:
         "about": STUDIES[name],
         "measured_against": found.against,
         "version": dougong.__version__,
-        "code": code_hash(_ROOMS),
+        "code": _code(),
         "machine": {**machine(), "system": platform.platform()},
         "software": software(),
         "seeds": sorted({row["seed"] for row in found.rows if "seed" in row}),
