@@ -152,3 +152,13 @@ def test_measures_of_calibration_against_their_definitions():
     table = reliability(p, is_correct)
     assert sum(row["pairs"] for row in table) == 20_000
     assert all(row["low95"] <= row["observed"] <= row["high95"] for row in table)
+
+
+def test_a_point_to_point_fit_that_leaves_the_surfaces_is_not_ok():
+    # Thin clouds: one survey's points pull the other's towards themselves, 0.16 m off, and every
+    # block agreed.
+    plain = measure("l", 6, SETTINGS)
+    pulled = measure("l", 6, SETTINGS.model_copy(update={"fine": "point-to-point"}))
+    assert (plain["status"], plain["is_correct"]) == ("ok", True)
+    assert pulled["status"] == "ambiguous"
+    assert "--fine point-to-plane" in pulled["reason"]

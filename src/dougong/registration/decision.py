@@ -81,6 +81,10 @@ def decide(
     clock.lap("fine")
     status, reason, spread = _judged(court, ruling, fine, params)
     evidence = _evidence(ruling, spread)
+    if status == "ok" and fine is not None and params.fine == "point-to-point":
+        pulled = _weigh_points(source, target, ruling, fine, params)
+        if pulled is not None:
+            (status, reason), evidence = pulled, replace(evidence, spread_m=np.inf)
     if status == "ok" and fine is not None and adjusted is None:
         left_open = height_left_open(court, source, target, T)
         status, reason = weigh_height(reason, left_open)
@@ -145,6 +149,29 @@ def _refined(
     fine = refine(source, target, ruling.winner.T, icp)
     adjusted = None if control is None else adjust(fine, control, icp.dof)
     return (fine if adjusted is None else adjusted.fine), adjusted
+
+
+def _weigh_points(
+    source: Prepared, target: Prepared, ruling: Ruling, fine: FineResult, params: Register
+) -> tuple[Literal["ambiguous"], str] | None:
+    """Return why a point-to-point pose is not ok: it is not where the surfaces meet.
+
+    Points that lie farther apart than the clouds are rough pull their pose towards themselves: two
+    samplings of one surface then meet decimetres off, each block agreeing. None: they do meet.
+    """
+    icp = _icp(params).model_copy(update={"method": "point-to-plane"})
+    plane = refine(source, target, ruling.winner.T, icp).T_target_source
+    shared = source.xyz[~source.is_ground]
+    shared = shared if len(shared) else source.xyz
+    off = np.linalg.norm(apply(plane, shared) - apply(fine.T_target_source, shared), axis=1)
+    apart = float(np.quantile(off, 0.95))
+    if apart <= params.verdict.most_spread_m:
+        return None
+    return "ambiguous", (
+        f"point-to-point and point-to-plane fits end {apart:.2g} m apart (95 %; at most "
+        f"{params.verdict.most_spread_m:.2g} m expected): the points are too far apart for the "
+        "first. Use --fine point-to-plane."
+    )
 
 
 def refused(reason: str) -> Found:
