@@ -161,4 +161,4 @@ def test_a_point_to_point_fit_that_leaves_the_surfaces_is_not_ok():
     pulled = measure("l", 6, SETTINGS.model_copy(update={"fine": "point-to-point"}))
     assert (plain["status"], plain["is_correct"]) == ("ok", True)
     assert pulled["status"] == "ambiguous"
-    assert "--fine point-to-plane" in pulled["reason"]
+    assert "point-to-plane" in pulled["reason"]

@@ -161,16 +161,16 @@ def _weigh_points(
     """
     icp = _icp(params).model_copy(update={"method": "point-to-plane"})
     plane = refine(source, target, ruling.winner.T, icp).T_target_source
-    shared = source.xyz[~source.is_ground]
-    shared = shared if len(shared) else source.xyz
-    off = np.linalg.norm(apply(plane, shared) - apply(fine.T_target_source, shared), axis=1)
-    apart = float(np.quantile(off, 0.95))
-    if apart <= params.verdict.most_spread_m:
+    off = apply(plane, source.xyz) - apply(fine.T_target_source, source.xyz)
+    apart = float(np.quantile(np.linalg.norm(off, axis=1), 0.95))
+    # The other half is for what the plane fit itself may be off.
+    limit = params.verdict.most_spread_m / 2.0
+    if apart <= limit:
         return None
     return "ambiguous", (
         f"point-to-point and point-to-plane fits end {apart:.2g} m apart (95 %; at most "
-        f"{params.verdict.most_spread_m:.2g} m expected): the points are too far apart for the "
-        "first. Use --fine point-to-plane."
+        f"{limit:.2g} m expected): the points are too far apart for the first. Use --fine "
+        "point-to-plane."
     )
 
 
