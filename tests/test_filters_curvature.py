@@ -10,6 +10,7 @@ from dougong import threads
 from dougong.errors import InputError
 from dougong.evaluation.facade import FEATURE, NOISE_LABELS, SURFACE, bracketed_facade
 from dougong.filters import protective
+from dougong.filters.balls import BLUR
 from dougong.filters.concentration import concentration_note
 from dougong.filters.curvature_weighted import (
     CurvatureWeighted,
@@ -22,6 +23,7 @@ from reference import protective as slow
 
 STEP = 2.0**-18
 PAPER = CurvatureWeighted(rule="paper")
+FAST = CurvatureWeighted(rule="paper", balls="fast")
 
 
 def on_lattice(points):
@@ -39,13 +41,18 @@ def crease(n, seed):
 
 
 @settings(max_examples=10, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(2, 250), st.sampled_from(["paper", "global"]))
-def test_is_the_twin_in_any_order(seed, n, rule):
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(2, 250),
+    st.sampled_from(["paper", "global"]),
+    st.sampled_from(["exact", "fast"]),
+)
+def test_is_the_twin_in_any_order(seed, n, rule, balls):
     points = crease(n, seed)
-    params = CurvatureWeighted(rule=rule)
+    params = CurvatureWeighted(rule=rule, balls=balls)
     chosen = curvature_weighted(points, params)
     kappa = chosen.attributes["curvature"]
-    np.testing.assert_allclose(kappa, twin.curvature(points, 0.3), atol=1e-10)
+    np.testing.assert_allclose(kappa, twin.curvature(points, 0.3, kind=balls), atol=1e-10)
     # A point exactly at the cut may differ by the rounding of the statistic: none or next to none.
     assert (chosen.is_kept != twin.curvature_weighted(points, params)).sum() <= 1
     shuffle = np.random.default_rng(seed).permutation(n)
@@ -73,16 +80,43 @@ def test_a_far_point_changes_nothing_but_itself():
         curvature_weighted([[1e11, 0, 0]], PAPER)
 
 
-def test_a_tile_with_its_halo_gives_what_the_whole_gives():
+@pytest.mark.parametrize("params", [PAPER, FAST], ids=["exact", "fast"])
+def test_a_tile_with_its_halo_gives_what_the_whole_gives(params):
     points, _ = bracketed_facade(200.0, 0.02, 3)
     points = on_lattice(points)
-    params = PAPER
     whole = curvature_weighted(points, params)
     core = (points[:, 0] >= 4.0) & (points[:, 0] < 7.0)
     read = (points[:, 0] >= 4.0 - halo_m(params)) & (points[:, 0] < 7.0 + halo_m(params))
     tile = curvature_weighted(points[read], params)
     np.testing.assert_array_equal(tile.is_kept[core[read]], whole.is_kept[core])
-    assert halo_m(params) == pytest.approx(0.9)
+    assert halo_m(PAPER) == pytest.approx(0.9)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.05, 2.0))
+def test_a_fast_ball_is_a_ball_but_for_its_blur(seed, radius_m):
+    points = np.random.default_rng(seed).uniform(-2.0 * radius_m, 2.0 * radius_m, (400, 3))
+    distance = np.linalg.norm(points - points[0], axis=1)
+    inside = twin.ball(points, 0, radius_m, "fast")
+    assert inside[distance < (1 - BLUR) * radius_m].all()
+    assert not inside[distance > (1 + BLUR) * radius_m].any()
+
+
+def test_fast_balls_remove_what_exact_ones_do():
+    points, labels = bracketed_facade(400.0, 0.02, 11)
+    exact, fast = (curvature_weighted(points, params).is_kept for params in (PAPER, FAST))
+    assert (exact != fast).mean() < 0.01
+    np.testing.assert_allclose(rates(exact, labels), rates(fast, labels), atol=1.0)
+
+
+@pytest.mark.parametrize("params", [PAPER, FAST], ids=["exact", "fast"])
+def test_dense_leaves_and_far_points_are_summed_exactly(params):
+    rng = np.random.default_rng(12)
+    points = on_lattice(rng.random((6000, 3)) * [1.0, 1.0, 0.02])
+    points[:40] += on_lattice(rng.normal(0, 40.0, (40, 3)))
+    points[40] = [9e5, -9e5, 100.0]
+    kappa = curvature_weighted(points, params).attributes["curvature"]
+    slow = twin.curvature(points, 0.3, every=37, kind=params.balls)
+    np.testing.assert_allclose(kappa[::37], slow, atol=1e-9)
 
 
 def test_threads_change_nothing():

@@ -11,7 +11,7 @@ from dougong.filters import (
     octree_voxel_grid,
     statistical,
 )
-from dougong.filters.curvature_weighted import build_lattice
+from dougong.filters.balls import build_lattice
 from dougong.filters.octree_voxel_grid import root_cube
 from dougong.formats import read
 from reference.filters import curvature

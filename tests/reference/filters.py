@@ -40,11 +40,20 @@ def statistical(points, multiplier, neighbours=None, radius_m=None):
     return mean <= known.mean() + multiplier * known.std() if len(known) else mean < np.inf
 
 
-def curvature(points, radius_m, every=1):
+def ball(points, i, radius_m, kind="exact"):
+    """Return which points (n,) lie in the ball of point i, exact or made of cells."""
+    if kind == "exact":
+        return np.linalg.norm(points - points[i], axis=1) <= radius_m
+    cells = np.floor(points / 2.0 ** np.floor(np.log2(radius_m / 16)))
+    edge = 2.0 ** np.floor(np.log2(radius_m / 16))
+    return ((cells - cells[i]) ** 2).sum(1) <= (radius_m / edge) ** 2
+
+
+def curvature(points, radius_m, every=1, kind="exact"):
     """Return surface variation in the ball of each point, itself included (eq. 1 to 3)."""
     result = []
-    for point in points[::every]:
-        inside = points[np.linalg.norm(points - point, axis=1) <= radius_m]
+    for i in range(0, len(points), every):
+        inside = points[ball(points, i, radius_m, kind)]
         centred = inside - inside.mean(0)
         values = np.linalg.eigvalsh(centred.T @ centred / len(inside))
         result.append(max(values[0], 0) / values.sum() if values.sum() > 0 else 0.0)
@@ -53,7 +62,7 @@ def curvature(points, radius_m, every=1):
 
 def curvature_weighted(points, p):
     """Return is_kept by eq. 4 to 6 in the reading `p.rule`."""
-    kappa = curvature(points, p.radius_init_m)
+    kappa = curvature(points, p.radius_init_m, kind=p.balls)
     swing = (1 - np.cos(2 * np.pi * p.tau_period * kappa)) / 2
     tau = p.tau_min + (p.tau_max - p.tau_min) * swing
     weight = 1 + p.alpha * np.tanh(p.gamma * kappa)
@@ -64,7 +73,7 @@ def curvature_weighted(points, p):
     is_known = np.isfinite(least)
     is_kept = np.zeros(len(points), bool)
     for i in np.flatnonzero(is_known):
-        in_ball = (table[i] <= p.radius_init_m) | (np.arange(len(points)) == i)
+        in_ball = ball(points, i, p.radius_init_m, p.balls)
         sample = least[is_known & (in_ball if p.rule == "paper" else True)]
         is_kept[i] = least[i] <= sample.mean() + tau[i] * sample.std()
     return is_kept

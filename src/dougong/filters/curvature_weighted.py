@@ -7,12 +7,13 @@ import math
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
 from dougong._checks import as_points
 from dougong.errors import InputError
 from dougong.filters import protective
+from dougong.filters.balls import BLUR, Balls, CellBalls, ExactBalls, Lattice, build_lattice
 from dougong.filters.concentration import concentration_note
 from dougong.filters.selection import Selection
 from dougong.filters.totals import Totals
@@ -23,10 +24,7 @@ from dougong.typing import Index, Mask, Values
 KIND: Literal["local", "two-pass", "global"] = "local"
 
 _BLOCK = 1 << 13
-_LEAVES = 1 << 9
-"""Points and leaves per task."""
-_LATTICE_STEPS = 1 << 16
-"""At least this many lattice steps in the largest radius: 8 micrometres for 0.3 m."""
+"""Points per task."""
 _STATISTIC_STEPS = 1 << 20
 """Steps that the largest possible statistic is divided into before it is summed."""
 
@@ -60,6 +58,10 @@ class CurvatureWeighted(Parameters):
     """How much curvature inflates distances (eq. 5)."""
     gamma: Annotated[float, Field(ge=0)] = 12.0
     """How fast it does so (eq. 5)."""
+    balls: Literal["exact", "fast"] = "exact"
+    """How ``paper`` and ``global`` take the ball of radius_init_m: ``exact``, or ``fast``, made of
+    cells of a sixteenth of the radius or less, one for all points of a cell: it holds every point
+    within 0.89 radii and none beyond 1.11."""
     tau_min: float = 1.2
     """Standard deviations above the mean at which the cut lies, at least (eq. 6, printed as c)."""
     tau_max: float = 1.8
@@ -99,74 +101,12 @@ class CurvatureWeighted(Parameters):
         return tau
 
 
-class Lattice(NamedTuple):
-    """Points on whole numbers, sorted into a tree: balls are summed exactly on it."""
-
-    points: NDArray[np.float64]
-    """(n, 3) whole numbers, in steps."""
-    order: Index
-    """(n,) place in the caller's array of each sorted point."""
-    boxes: NDArray[np.float64]
-    """(2 leaves, 6)."""
-    step_m: float
-    """Metres per step; a power of two."""
-
-    def unsorted(self, values: NDArray[np.float64]) -> Values:
-        """Return per-point `values`, given in sorted order, in the caller's order."""
-        result = np.empty_like(values)
-        result[self.order] = values
-        return result
-
-
 def halo_m(params: CurvatureWeighted) -> float:
     """Return how far the rule reaches: the curvature of the neighbours of the neighbours."""
     if params.rule == "protective":
         return protective.halo_m(params.reach_m)
-    return 2.0 * params.radius_init_m + params.radius_max_m
-
-
-def build_lattice(points: ArrayLike, radius_m: float) -> Lattice:
-    """Return `points` (n, 3), rounded to steps of at most radius_m / 2**16, as a tree.
-
-    The steps count from the local origin, so parts of a cloud are rounded alike.
-
-    Raises
-    ------
-    InputError
-        The points spread over more than 2**52 steps.
-    """
-    from dougong.filters.neighbourhood import build_index
-
-    xyz = as_points(points)
-    step_m = 2.0 ** math.floor(math.log2(radius_m / _LATTICE_STEPS))
-    steps = np.rint(xyz / step_m)
-    if len(xyz) and np.abs(steps).max() > 2**52:
-        msg = (
-            f"points reach {np.abs(xyz).max():.3g} m from the local origin, too far for balls of "
-            f"{radius_m} m (at most {2**52 * step_m:.3g} m). Move the origin or drop far points."
-        )
-        raise InputError(msg)
-    return Lattice(*build_index(steps), step_m)
-
-
-def surface_variation(lattice: Lattice, radius_m: float) -> Values:
-    """Return the surface variation (n,) of every point's ball, in sorted order (eq. 1 to 3)."""
-    from dougong.kernels import balls
-
-    n = len(lattice.points)
-    moments = np.zeros((len(lattice.boxes), 9), np.int64)
-    balls.node_moments(lattice.points, moments)
-    variation = np.zeros(n)
-    radius2 = (radius_m / lattice.step_m) ** 2
-
-    def task(first: int, last: int) -> None:
-        balls.ball_variation(
-            lattice.points, lattice.boxes, moments, radius2, first, last, variation
-        )
-
-    if n:
-        for_blocks(len(lattice.boxes) // 2, _LEAVES, task)
-    return variation
+    blur = BLUR if params.balls == "fast" else 0.0
+    return 2.0 * params.radius_init_m * (1.0 + blur) + params.radius_max_m
 
 
 def least_weighted_distance(lattice: Lattice, curvature: Values, p: CurvatureWeighted) -> Values:
@@ -185,72 +125,58 @@ def least_weighted_distance(lattice: Lattice, curvature: Values, p: CurvatureWei
     return least * lattice.step_m
 
 
-def _local_statistics(lattice: Lattice, steps: Index, radius_m: float) -> tuple[Values, Values]:
+def _local_statistics(balls: Balls, steps: Index) -> tuple[Values, Values]:
     """Return mean and deviation (n,) of the `steps` >= 0 (n,) in each point's ball."""
-    from dougong.kernels import balls
-
-    n = len(lattice.points)
-    sums = np.zeros((len(lattice.boxes), 3), np.int64)
-    balls.node_sums(steps, sums)
-    totals = np.zeros((n, 3), np.int64)
-    radius2 = (radius_m / lattice.step_m) ** 2
-
-    def task(first: int, last: int) -> None:
-        balls.ball_totals(lattice.points, lattice.boxes, steps, sums, radius2, first, last, totals)
-
-    if n:
-        for_blocks(len(lattice.boxes) // 2, _LEAVES, task)
+    totals = balls.totals(steps)
     count = np.maximum(totals[:, 0], 1).astype(np.float64)
     mean = totals[:, 1] / count
     spread = totals[:, 2] / count - mean * mean
     return mean, np.sqrt(np.maximum(spread, 0.0))
 
 
-class _Population(NamedTuple):
-    """The statistic m of n points, in sorted order, and what is usual round each."""
+class _Judged(NamedTuple):
+    """What eq. 1 to 5 say of n points, in sorted order, and what is usual round each."""
 
+    lattice: Lattice
+    curvature: Values
     is_alone: Mask
     steps: Index
-    """(n,) m in whole steps; -1 where alone."""
+    """(n,) the statistic m in whole steps; -1 where alone."""
     mean: Values | float
     deviation: Values | float
 
+    def verdict(self, p: CurvatureWeighted) -> tuple[Mask, Values]:
+        """Return the verdict (n,) of eq. 6 and its margin (n,), m as a share of the cut.
 
-def _population(
-    lattice: Lattice, curvature: Values, p: CurvatureWeighted, totals: Totals | None = None
-) -> _Population:
-    """Return the statistic and its reference population: eq. 5 and what eq. 6 compares with."""
+        An empty neighbourhood is an outlier, its margin infinite.
+        """
+        cut = self.mean + p.tau(self.curvature) * self.deviation
+        is_outlier: Mask = self.is_alone | (self.steps > cut)
+        # Half a step holds up a cut of zero, where all points are duplicates.
+        margin = np.where(self.is_alone, np.inf, self.steps / np.maximum(cut, 0.5))
+        return is_outlier, margin
+
+
+def _judge(points: ArrayLike, p: CurvatureWeighted, totals: Totals | None = None) -> _Judged:
+    """Return curvature, statistic and reference population of `points` (n, 3), eq. 1 to 5."""
+    lattice = build_lattice(points, max(p.radius_init_m, p.radius_max_m))
+    kind = CellBalls if p.balls == "fast" else ExactBalls
+    balls: Balls = kind(lattice, p.radius_init_m)
+    curvature = balls.variation()
     least = least_weighted_distance(lattice, curvature, p)
     is_alone = ~np.isfinite(least)
     step_m = p.radius_max_m * (1.0 + p.alpha) / _STATISTIC_STEPS
     steps = np.where(is_alone, -1.0, np.rint(least / step_m)).astype(np.int64)
     if p.rule == "global":
         totals = totals or Totals.of(steps[~is_alone])
-        return _Population(is_alone, steps, totals.mean, totals.deviation)
-    return _Population(is_alone, steps, *_local_statistics(lattice, steps, p.radius_init_m))
+        return _Judged(lattice, curvature, is_alone, steps, totals.mean, totals.deviation)
+    return _Judged(lattice, curvature, is_alone, steps, *_local_statistics(balls, steps))
 
 
 def own_totals(points: ArrayLike, p: CurvatureWeighted, own: int) -> Totals:
     """Return what the first `own` of `points` add to the statistics of rule ``global``."""
-    lattice = build_lattice(points, max(p.radius_init_m, p.radius_max_m))
-    curvature = surface_variation(lattice, p.radius_init_m)
-    found = _population(lattice, curvature, p)
-    return Totals.of(found.steps[(lattice.order < own) & ~found.is_alone])
-
-
-def _verdict(
-    lattice: Lattice, curvature: Values, p: CurvatureWeighted, totals: Totals | None
-) -> tuple[Mask, Values]:
-    """Return the verdict (n,) of eq. 6 and its margin (n,), the statistic as a share of the cut.
-
-    In sorted order. An empty neighbourhood is an outlier, its margin infinite.
-    """
-    is_alone, steps, mean, deviation = _population(lattice, curvature, p, totals)
-    cut = mean + p.tau(curvature) * deviation
-    is_outlier: Mask = is_alone | (steps > cut)
-    # Half a step holds up a cut of zero, where all points are duplicates.
-    margin = np.where(is_alone, np.inf, steps / np.maximum(cut, 0.5))
-    return is_outlier, margin
+    found = _judge(points, p)
+    return Totals.of(found.steps[(found.lattice.order < own) & ~found.is_alone])
 
 
 def excess(points: ArrayLike, params: CurvatureWeighted | None = None) -> Values:
@@ -259,11 +185,10 @@ def excess(points: ArrayLike, params: CurvatureWeighted | None = None) -> Values
     Above 1 the rules ``paper`` and ``global`` remove a point; inf for a point alone. For curves.
     """
     p = params or CurvatureWeighted()
-    lattice = build_lattice(points, max(p.radius_init_m, p.radius_max_m))
-    curvature = surface_variation(lattice, p.radius_init_m)
-    is_alone, steps, mean, deviation = _population(lattice, curvature, p)
-    above = (steps - mean) / np.maximum(p.tau(curvature) * deviation, 1e-9)
-    return lattice.unsorted(np.where(is_alone, np.inf, above))
+    found = _judge(points, p)
+    swing = np.maximum(p.tau(found.curvature) * found.deviation, 1e-9)
+    above = np.where(found.is_alone, np.inf, (found.steps - found.mean) / swing)
+    return found.lattice.unsorted(above)
 
 
 def curvature_weighted(
@@ -296,29 +221,29 @@ def curvature_weighted(
     Notes
     -----
     ``paper`` and ``global`` round coordinates to 2**-18 m (for 0.3 m) and sum exact integers, so
-    nothing depends on the order of the points; cost per ball grows with the square root of the
-    points in it. Tile class: local, with the halo of `halo_m` (``protective`` with a reach_m: 13 of
-    it; ``paper``: 2 radius_init_m + radius_max_m); ``global`` is two-pass.
+    nothing depends on the order of the points. The cost of an exact ball grows with the square root
+    of the points in it, that of a fast one does not.
+    Tile class: local, with the halo of `halo_m` (``protective`` with a reach_m: 13 of it;
+    ``paper``: 2 radius_init_m + radius_max_m, fast 0.22 radius_init_m more); ``global`` is
+    two-pass.
     """
     p = params or CurvatureWeighted()
     if p.rule == "protective":
         assert not isinstance(whole, Totals)
         return judge_protective(points, p, voxel_count, whole)[0]
     assert not isinstance(whole, protective.Whole)
-    lattice = build_lattice(points, max(p.radius_init_m, p.radius_max_m))
+    found = _judge(points, p, whole)
+    lattice = found.lattice
     n = len(lattice.points)
-    if n == 0:
-        return Selection(is_kept=np.zeros(0, bool), attributes={"curvature": np.zeros(0)})
-    curvature = surface_variation(lattice, p.radius_init_m)
+    is_outlier, margin = found.verdict(p)
     is_kept = np.empty(n, bool)
-    is_outlier, margin = _verdict(lattice, curvature, p, whole)
     is_kept[lattice.order] = ~is_outlier
-    if p.solid_voxel_count is not None:
+    if n and p.solid_voxel_count is not None:
         is_kept |= _is_solid(voxel_count, n, p.solid_voxel_count)
     return Selection(
         is_kept=is_kept,
         attributes={
-            "curvature": lattice.unsorted(curvature),
+            "curvature": lattice.unsorted(found.curvature),
             "removal_margin": lattice.unsorted(margin),
         },
     )

@@ -203,7 +203,7 @@ def octree_voxel_grid(
             is_kept=np.zeros(0, bool), attributes={"voxel_count": np.zeros(0, np.int32)}
         )
     low, _, voxel_m = root or root_cube(xyz, params)
-    places, run_starts = _runs(xyz, low, voxel_m)
+    places, run_starts = runs_of_cells(xyz, low, voxel_m)
     runs = len(run_starts) - 1
     chosen, twins = np.empty(runs, np.int64), np.empty(runs, np.int64)
     counts = np.empty(n, np.int64)
@@ -221,7 +221,7 @@ def octree_voxel_grid(
     return Selection(is_kept=is_kept, attributes={"voxel_count": counts.astype(np.int32)})
 
 
-def _runs(xyz: Points, low: NDArray[np.float64], voxel_m: float) -> tuple[Index, Index]:
+def runs_of_cells(xyz: Points, low: NDArray[np.float64], voxel_m: float) -> tuple[Index, Index]:
     """Return places that sort the points by voxel, and where each voxel's run starts (and ends)."""
     from dougong.kernels import order
 

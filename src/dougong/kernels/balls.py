@@ -10,10 +10,15 @@ import numpy as np
 
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel, summing_kernel
-from dougong.kernels.boxtree import box_distance2, box_far_distance2
+from dougong.kernels.ball_walk import SHARE, look, make_walk, size_of
+from dougong.kernels.boxtree import box_distance2
 from dougong.kernels.moments import eigen3
 
 _DEPTH = 64
+LEAF = 16
+"""Most points of a leaf, see `build_index`."""
+_CHUNK = 64
+"""Leaves on the rim that are looked at together: their points fit the fast cache."""
 
 
 @kernel
@@ -63,80 +68,46 @@ def node_sums(values: Ints, out: Ints) -> None:
 
 
 @kernel
-def _size_of(node: int, n: int) -> int:
-    """Return how many of n points lie under `node`."""
-    level = 1
-    while 2 * level <= node:
-        level *= 2
-    return (node - level + 1) * n // level - (node - level) * n // level
+def _gather(points: Floats, leaves: int, rim: Ints, start: int, stop: int, near: Floats) -> int:
+    """Fill near (3, ..) with the points of leaf nodes rim[start:stop]; return how many."""
+    n = points.shape[0]
+    held = 0
+    for r in range(start, stop):
+        leaf = rim[r] - leaves
+        for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
+            near[0, held], near[1, held], near[2, held] = points[i, 0], points[i, 1], points[i, 2]
+            held += 1
+    return held
 
 
 @kernel
-def _reach2(boxes: Floats, a: int, b: int) -> tuple[float, float]:
-    """Return the least and the largest squared distance between points of boxes a and b."""
-    least = largest = 0.0
-    for axis in range(3):
-        ahead = boxes[b, axis] - boxes[a, 3 + axis]
-        behind = boxes[a, axis] - boxes[b, 3 + axis]
-        gap = max(ahead, behind, 0.0)
-        span = max(boxes[b, 3 + axis] - boxes[a, axis], boxes[a, 3 + axis] - boxes[b, axis])
-        least += gap * gap
-        largest += span * span
-    return least, largest
-
-
-@kernel
-def _parts(
-    boxes: Floats, asked: int, radius2: float, stack: Ints, whole: Ints, rim: Ints
-) -> tuple[int, int]:
-    """Sort out the tree for the balls round all points of leaf node `asked`.
-
-    Lists the nodes that lie in every ball (whole) and the leaf nodes that some ball may touch
-    (rim); returns how many of each. The points of a leaf share this, so it is done once for them.
-    """
-    leaves = boxes.shape[0] // 2
-    n_whole = n_rim = 0
-    stack[0] = 1
-    height = 1
-    while height > 0:
-        height -= 1
-        node = stack[height]
-        least, largest = _reach2(boxes, asked, node)
-        if least > radius2:
-            continue
-        if largest <= radius2:
-            whole[n_whole] = node
-            n_whole += 1
-        elif node >= leaves:
-            rim[n_rim] = node
-            n_rim += 1
-        else:
-            stack[height] = 2 * node
-            stack[height + 1] = 2 * node + 1
-            height += 2
-    return n_whole, n_rim
+def _gather_values(
+    values: Ints, leaves: int, rim: Ints, start: int, stop: int, given: Floats
+) -> None:
+    """Fill `given` with the values of the points that `_gather` finds."""
+    n = values.shape[0]
+    held = 0
+    for r in range(start, stop):
+        leaf = rim[r] - leaves
+        for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
+            given[held] = values[i]
+            held += 1
 
 
 @summing_kernel
 def _rim_moments(
-    points: Floats,
-    first: int,
-    last: int,
-    x: float,
-    y: float,
-    z: float,
-    radius2: float,
-    sums: Floats,
+    near: Floats, held: int, x: float, y: float, z: float, radius2: float, sums: Floats
 ) -> None:
-    """Add moments about (x, y, z) of points first .. last - 1 inside the ball to sums (10,).
+    """Add moments about (x, y, z) of the first `held` points inside the ball to sums (10,).
 
-    Whole numbers below 2**53: exact in any order, so the sums may be vectorised.
+    Whole numbers below 2**53: exact in any order, so the sums may be vectorised. One long loop over
+    all leaves that the balls of these queries touch is faster than to sort them out for each.
     """
     m = sx = sy = sz = xx = yy = zz = xy = xz = yz = 0.0
-    for i in range(np.uint64(first), np.uint64(last)):
-        dx = points[i, 0] - x
-        dy = points[i, 1] - y
-        dz = points[i, 2] - z
+    for i in range(np.uint64(held)):
+        dx = near[0, i] - x
+        dy = near[1, i] - y
+        dz = near[2, i] - z
         # A far point of the leaf may be so far that its products are not exact: it has weight 0.
         is_in = 1.0 if dx * dx + dy * dy + dz * dz <= radius2 else 0.0
         dx *= is_in
@@ -167,15 +138,15 @@ def _rim_moments(
 @kernel
 def _add_node(moments: Ints, node: int, n: int, about: Ints) -> None:
     """Add count and moments of `node` to about (10,)."""
-    about[0] += _size_of(node, n)
+    about[0] += size_of(node, n)
     for c in range(9):
         about[1 + c] += moments[node, c]
 
 
 @kernel
-def _add_moved(about: Ints, x: float, y: float, z: float, sums: Floats) -> None:
-    """Add moments about (0, 0, 0), modulo 2**64, to sums (10,) about (x, y, z), exactly."""
-    a, b, c = np.int64(x), np.int64(y), np.int64(z)
+def add_moved(about: Ints, centre: Floats, sums: Floats) -> None:
+    """Add moments about (0, 0, 0), modulo 2**64, to sums (10,) about the centre (3,), exactly."""
+    a, b, c = np.int64(centre[0]), np.int64(centre[1]), np.int64(centre[2])
     m, sx, sy, sz = about[0], about[1], about[2], about[3]
     sums[0] += m
     sums[1] += sx - m * a
@@ -190,7 +161,7 @@ def _add_moved(about: Ints, x: float, y: float, z: float, sums: Floats) -> None:
 
 
 @kernel
-def _variation(sums: Floats, a: Floats, v: Floats) -> float:
+def variation_of(sums: Floats, a: Floats, v: Floats) -> float:
     """Return l3 / (l1 + l2 + l3) of the covariance of sums (10,); a and v (3, 3) are work space."""
     m = sums[0]
     for row in range(3):
@@ -222,31 +193,57 @@ def ball_variation(
     """
     n = points.shape[0]
     leaves = boxes.shape[0] // 2
-    stack = np.empty(_DEPTH, np.int64)
-    whole, rim = np.empty(leaves, np.int64), np.empty(leaves, np.int64)
-    shared, about, sums = np.empty(10, np.int64), np.empty(10, np.int64), np.empty(10, np.float64)
+    walk, share = make_walk(leaves), min(SHARE, leaves)
+    about = np.empty(10, np.int64)
+    sums = np.empty((SHARE * LEAF, 10), np.float64)
+    near = np.empty((3, _CHUNK * LEAF), np.float64)
     a, v = np.empty((3, 3), np.float64), np.empty((3, 3), np.float64)
-    for asked in range(first_leaf, last_leaf):
-        n_whole, n_rim = _parts(boxes, leaves + asked, radius2, stack, whole, rim)
-        shared[:] = 0
+    for asked in range(first_leaf, last_leaf, share):
+        n_whole, n_rim = look(boxes, asked, radius2, walk)
+        about[:] = 0
         for w in range(n_whole):
-            _add_node(moments, whole[w], n, shared)
-        for q in range(asked * n // leaves, (asked + 1) * n // leaves):
-            x, y, z = points[q, 0], points[q, 1], points[q, 2]
-            sums[:] = 0.0
-            about[:] = shared
-            for r in range(n_rim):
-                node = rim[r]
-                if box_distance2(boxes, node, x, y, z) > radius2:
-                    continue
-                if box_far_distance2(boxes, node, x, y, z) <= radius2:
-                    _add_node(moments, node, n, about)
-                    continue
-                first = (node - leaves) * n // leaves
-                last = (node - leaves + 1) * n // leaves
-                _rim_moments(points, first, last, x, y, z, radius2, sums)
-            _add_moved(about, x, y, z, sums)
-            variation[q] = _variation(sums, a, v)
+            _add_node(moments, walk.whole[w], n, about)
+        begin, end = asked * n // leaves, (asked + share) * n // leaves
+        sums[:] = 0.0
+        for start in range(0, n_rim, _CHUNK):
+            stop = min(start + _CHUNK, n_rim)
+            held = _gather(points, leaves, walk.rim, start, stop, near)
+            for q in range(begin, end):
+                x, y, z = points[q, 0], points[q, 1], points[q, 2]
+                _rim_moments(near, held, x, y, z, radius2, sums[q - begin])
+        for q in range(begin, end):
+            add_moved(about, points[q], sums[q - begin])
+            variation[q] = variation_of(sums[q - begin], a, v)
+
+
+@summing_kernel
+def _rim_totals(
+    near: Floats,
+    given: Floats,
+    held: int,
+    x: float,
+    y: float,
+    z: float,
+    radius2: float,
+    sums: Floats,
+) -> None:
+    """Add count, sum and sum of squares of `given` >= 0 inside the ball to sums (3,).
+
+    Whole numbers that add up to less than 2**53: exact in any order.
+    """
+    count = total = squares = 0.0
+    for i in range(np.uint64(held)):
+        dx = near[0, i] - x
+        dy = near[1, i] - y
+        dz = near[2, i] - z
+        value = given[i]
+        is_in = 1.0 if dx * dx + dy * dy + dz * dz <= radius2 and value >= 0.0 else 0.0
+        count += is_in
+        total += is_in * value
+        squares += is_in * value * value
+    sums[0] += count
+    sums[1] += total
+    sums[2] += squares
 
 
 @kernel
@@ -267,34 +264,27 @@ def ball_totals(
     """
     n = points.shape[0]
     leaves = boxes.shape[0] // 2
-    stack = np.empty(_DEPTH, np.int64)
-    whole, rim = np.empty(leaves, np.int64), np.empty(leaves, np.int64)
-    shared = np.empty(3, np.int64)
-    for asked in range(first_leaf, last_leaf):
-        n_whole, n_rim = _parts(boxes, leaves + asked, radius2, stack, whole, rim)
-        shared[:] = 0
+    walk, share = make_walk(leaves), min(SHARE, leaves)
+    about = np.empty(3, np.int64)
+    found = np.empty((SHARE * LEAF, 3), np.float64)
+    near, given = np.empty((3, _CHUNK * LEAF), np.float64), np.empty(_CHUNK * LEAF, np.float64)
+    for asked in range(first_leaf, last_leaf, share):
+        n_whole, n_rim = look(boxes, asked, radius2, walk)
+        about[:] = 0
         for w in range(n_whole):
+            about += sums[walk.whole[w]]
+        begin, end = asked * n // leaves, (asked + share) * n // leaves
+        found[:] = 0.0
+        for start in range(0, n_rim, _CHUNK):
+            stop = min(start + _CHUNK, n_rim)
+            held = _gather(points, leaves, walk.rim, start, stop, near)
+            _gather_values(values, leaves, walk.rim, start, stop, given)
+            for q in range(begin, end):
+                x, y, z = points[q, 0], points[q, 1], points[q, 2]
+                _rim_totals(near, given, held, x, y, z, radius2, found[q - begin])
+        for q in range(begin, end):
             for c in range(3):
-                shared[c] += sums[whole[w], c]
-        for q in range(asked * n // leaves, (asked + 1) * n // leaves):
-            x, y, z = points[q, 0], points[q, 1], points[q, 2]
-            out[q, :] = shared
-            for r in range(n_rim):
-                node = rim[r]
-                if box_distance2(boxes, node, x, y, z) > radius2:
-                    continue
-                if box_far_distance2(boxes, node, x, y, z) <= radius2:
-                    for c in range(3):
-                        out[q, c] += sums[node, c]
-                    continue
-                for i in range((node - leaves) * n // leaves, (node - leaves + 1) * n // leaves):
-                    dx = points[i, 0] - x
-                    dy = points[i, 1] - y
-                    dz = points[i, 2] - z
-                    if dx * dx + dy * dy + dz * dz <= radius2 and values[i] >= 0:
-                        out[q, 0] += 1
-                        out[q, 1] += values[i]
-                        out[q, 2] += values[i] * values[i]
+                out[q, c] = about[c] + np.int64(found[q - begin, c])
 
 
 @kernel

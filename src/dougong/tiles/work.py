@@ -20,6 +20,7 @@ from dougong.filters.curvature_weighted import (
     curvature_weighted,
     own_totals,
 )
+from dougong.filters.curvature_weighted import halo_m as curvature_halo_m
 from dougong.filters.curvature_weighted import judge_protective as judge_rule
 from dougong.filters.low_outliers import Levels, is_low_outlier
 from dougong.filters.neighbourhood import build_index, knn
@@ -220,11 +221,6 @@ def count_curvature(job: Job) -> tuple[Arrays, Record]:
     part = _with_halo(job, curvature_halo_m(job.params))
     totals = own_totals(part.points, job.params, part.own)
     return {}, {"totals": [totals.count, totals.total, totals.squares]}
-
-
-def curvature_halo_m(params: CurvatureWeighted) -> float:
-    """Return how far the rules paper and global reach."""
-    return 2.0 * params.radius_init_m + params.radius_max_m
 
 
 def judge_protective(job: Job) -> tuple[Arrays, Record]:

@@ -193,7 +193,11 @@ OPERATIONS: dict[str, Operation] = {
     "cwasf": Operation(
         f"curvature-weighted filter (rule paper), {RELIEF_RADIUS_M} m at 5 mm spacing",
         "facade",
-        (Contender(OURS, ours.cwasf),),
+        (
+            Contender(OURS, ours.cwasf),
+            Contender("dougong fast balls", ours.cwasf_fast, is_equal=False),
+            Contender("dougong protective", ours.cwasf_protective, is_equal=False),
+        ),
         _kept,
     ),
     "csf": Operation(

@@ -71,11 +71,11 @@ def ror(arrays: Arrays, threads: int) -> Any:
 
 def curvature(arrays: Arrays, threads: int) -> Any:
     """Return surface variation (n,), exact."""
-    from dougong.filters.curvature_weighted import build_lattice, surface_variation
+    from dougong.filters.balls import ExactBalls, build_lattice
 
     del threads
     lattice = build_lattice(arrays["points"], RELIEF_RADIUS_M)
-    return lattice.unsorted(surface_variation(lattice, RELIEF_RADIUS_M))
+    return lattice.unsorted(ExactBalls(lattice, RELIEF_RADIUS_M).variation())
 
 
 def csf(arrays: Arrays, threads: int) -> Any:
@@ -117,9 +117,23 @@ def icp(arrays: Arrays, threads: int) -> Any:
 
 
 def cwasf(arrays: Arrays, threads: int) -> Any:
-    """Return how many points the curvature-weighted filter keeps."""
+    """Return how many points the curvature-weighted filter keeps by rule ``paper``."""
+    return _cwasf(arrays, threads, rule="paper")
+
+
+def cwasf_fast(arrays: Arrays, threads: int) -> Any:
+    """Return the same with fast balls."""
+    return _cwasf(arrays, threads, rule="paper", balls="fast")
+
+
+def cwasf_protective(arrays: Arrays, threads: int) -> Any:
+    """Return the same for rule ``protective``."""
+    return _cwasf(arrays, threads, rule="protective")
+
+
+def _cwasf(arrays: Arrays, threads: int, **params: Any) -> Any:
     from dougong.filters import CurvatureWeighted, curvature_weighted
 
     del threads
-    params = CurvatureWeighted(rule="paper", radius_init_m=RELIEF_RADIUS_M)
-    return np.count_nonzero(curvature_weighted(arrays["points"], params).is_kept)
+    chosen = CurvatureWeighted(radius_init_m=RELIEF_RADIUS_M, **params)
+    return np.count_nonzero(curvature_weighted(arrays["points"], chosen).is_kept)
