@@ -5,6 +5,7 @@ import math
 import numpy as np
 from scipy.stats import binom
 
+from dougong.filters import local_spacing
 from reference.filters import distances
 
 
@@ -104,9 +105,9 @@ def judge(points, alpha, gamma, limits, rule, reach=0.5):
     ranked = np.sort(table, axis=1)
     eighth = ranked[:, rule.TESTS - 1] if n > rule.TESTS else np.full(n, np.inf)
     own = np.maximum(np.minimum(eighth, reach) * math.sqrt(math.pi / rule.TESTS), 2.0**-14)
-    held, near_log = spacing(points, own, rule.NEAR_CELLS * reach)
-    _, far_log = spacing(points, own, rule.FAR_CELLS * reach)
-    usual = np.exp2((held * near_log + rule.FEW * far_log) / (held + rule.FEW))
+    held, near_log = spacing(points, own, local_spacing.NEAR_CELLS * reach)
+    _, far_log = spacing(points, own, local_spacing.FAR_CELLS * reach)
+    usual = np.exp2((held * near_log + local_spacing.FEW * far_log) / (held + local_spacing.FEW))
     args = (alpha, gamma, reach, rule.NEIGHBOURS, usual, math.pi / 2 * limits[-1])
     near, axes, divisors = frames(points, order, table, *args)
     margin, links = np.full(n, np.inf), []

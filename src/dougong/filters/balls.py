@@ -4,20 +4,24 @@ Points are rounded to whole steps of a lattice and summed in integers, so a sum 
 order, tile or thread count. Kernels are imported when called.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dougong._checks import as_points
 from dougong.errors import InputError
-from dougong.filters.neighbourhood import Neighbourhood, build_index
 from dougong.filters.octree_voxel_grid import runs_of_cells
 from dougong.threads import for_blocks
 from dougong.typing import Index, Values
+
+if TYPE_CHECKING:
+    from dougong.filters.neighbourhood import Neighbourhood
 
 _LEAVES = 1 << 9
 """Leaves per task; a power of two."""
@@ -59,6 +63,8 @@ def build_lattice(points: ArrayLike, radius_m: float) -> Lattice:
     InputError
         The points spread over more than 2**52 steps.
     """
+    from dougong.filters.neighbourhood import build_index
+
     xyz = as_points(points)
     step_m = 2.0 ** math.floor(math.log2(radius_m / _LATTICE_STEPS))
     steps = np.rint(xyz / step_m)
@@ -212,6 +218,8 @@ def _cells_of(points: NDArray[np.float64], edge: float) -> tuple[Neighbourhood, 
     The tree's points are whole numbers of cells. The points of the cell whose ``order`` is r are
     places[starts[r]:starts[r + 1]].
     """
+    from dougong.filters.neighbourhood import build_index
+
     if not len(points):
         return build_index(points), np.zeros(0, np.int64), np.zeros(1, np.int64)
     low = np.floor(points.min(axis=0) / edge) * edge

@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dougong.filters.local_spacing import FAR_CELLS, SMALLEST_M, STEPS, local_spacing
 from dougong.filters.ranks import ValueBlocks, at_rank
 from dougong.threads import for_blocks
-from dougong.typing import Index, Points, Values
+from dougong.typing import Values
 
 if TYPE_CHECKING:
     from dougong.filters.neighbourhood import Neighbourhood
@@ -33,10 +34,6 @@ REACH_M = 0.5
 SPARSE, DENSE = 5.0, 50.0
 """Median spacings that the reach must hold, and may hold before it is halved: 0.5 m serves from
 100 to 10,000 points/m2. In a longer reach scattered noise would have a spacing of its own."""
-NEAR_CELLS, FAR_CELLS = 0.5, 1.0
-"""Cells, in reaches, in which the spacing is averaged: out to 1.5 cells round a point."""
-FEW = 50.0
-"""The far average counts like this many near points."""
 LINK = 2.0
 """Points within this many spacings make a group: an even surface holds together from 1.2 on."""
 GROUP = 2.0
@@ -48,9 +45,6 @@ ROW_NEIGHBOURS, ROW_WIDTH, ROW_ACCIDENTS = 24, 0.5, 1e-3
 either side) has so many that chance would make fewer than this number of such rows there."""
 ROW_REACH = 0.1
 """In rows the spacing counts as at most this many reaches."""
-_STEPS = 1 << 16
-"""Steps per unit in which logarithms are summed, exactly."""
-_SMALLEST_M = 2.0**-14
 _BLOCK = 1 << 13
 
 
@@ -118,22 +112,7 @@ def reach_for(points: ArrayLike) -> float:
     """Return the reach, metres, for a cloud (n, 3): `REACH_M` where it suits."""
     from dougong.filters.neighbourhood import build_index
 
-    return _reach_of(build_index(points))
-
-
-def _reach_of(index: Neighbourhood) -> float:
-    from dougong.filters.neighbourhood import blocks_of_leaves, self_knn_block
-
-    n = len(index.points)
-    eighth = np.full(n, np.inf)
-
-    def task(first: int, last: int) -> None:
-        start, _, distance2 = self_knn_block(index, TESTS, np.inf, first, last)
-        eighth[start : start + len(distance2)] = np.sqrt(distance2[:, -1])
-
-    if n > TESTS:
-        for_blocks(*blocks_of_leaves(index), task)
-    return reach_of(lambda: (eighth,), n)
+    return _neighbours(build_index(points), None)[2]
 
 
 def reach_of(eighth_m: ValueBlocks, points: int) -> float:
@@ -144,7 +123,7 @@ def reach_of(eighth_m: ValueBlocks, points: int) -> float:
     reach = REACH_M
     while reach < SPARSE * spacing:
         reach *= 2.0
-    while reach > 2.0 * DENSE * max(spacing, _SMALLEST_M):
+    while reach > 2.0 * DENSE * max(spacing, SMALLEST_M):
         reach /= 2.0
     return reach
 
@@ -189,11 +168,9 @@ def judge(
     index = build_index(points)
     n = len(index.points)
     is_whole = reach_m is None and whole is None
+    places, own, reach = _neighbours(index, reach_m if whole is None else whole.reach_m)
     if whole is None:
-        reach = _reach_of(index) if reach_m is None else reach_m
         whole = Whole(reach, is_few=is_whole and n <= TESTS, own=n)
-    reach = whole.reach_m
-    places, own = _neighbours(index, reach)
     spacing = local_spacing(index.points, own, reach)
     curvature, frame = np.zeros(n), np.zeros((n, 9), np.float32)
     margin, decisive = np.empty(n), np.zeros(n, np.uint8)
@@ -253,80 +230,36 @@ def _excuse_rows(index: Neighbourhood, spacing: Values, reach: float, margin: Va
     margin[chosen] = np.minimum(margin[chosen], excused)
 
 
-def _neighbours(index: Neighbourhood, reach: float) -> tuple[NDArray[np.int32], Values]:
-    """Return the places (n, 12) of every point's nearest and the spacing (n,) they show."""
+def _neighbours(
+    index: Neighbourhood, reach_m: float | None
+) -> tuple[NDArray[np.int32], Values, float]:
+    """Return the places (n, 12) of every point's nearest, the spacing (n,) they show, the reach.
+
+    Without a `reach_m` all are searched first: what they show says how far they may be.
+    """
     from dougong.filters.neighbourhood import blocks_of_leaves, self_knn_block
+    from dougong.kernels import protective as kernels
 
     n = len(index.points)
     places = np.full((n, NEIGHBOURS), -1, np.int32)
-    own = np.empty(n)
+    eighth = np.full(n, np.inf)
+    limit2 = np.inf if reach_m is None else reach_m**2
 
     def task(first: int, last: int) -> None:
-        start, found, distance2 = self_knn_block(index, NEIGHBOURS, reach**2, first, last)
+        start, found, distance2 = self_knn_block(index, NEIGHBOURS, limit2, first, last)
         places[start : start + len(found)] = found
-        eighth = np.minimum(np.sqrt(distance2[:, TESTS - 1]), reach)
-        own[start : start + len(found)] = eighth * math.sqrt(math.pi / TESTS)
+        eighth[start : start + len(found)] = np.sqrt(distance2[:, TESTS - 1])
 
     if n:
         for_blocks(*blocks_of_leaves(index), task)
-    return places, own
-
-
-def local_spacing(points: Points, own_m: Values, reach_m: float) -> Values:
-    """Return the spacing (n,) usual round every point: the geometric mean over its surroundings.
-
-    A geometric mean by points: noise is few and hardly counts. Where few points are near, the
-    wider surroundings count more, so a flock of birds is not measured by itself.
-    """
-    steps = np.rint(np.log2(np.maximum(own_m, _SMALLEST_M) / _SMALLEST_M) * _STEPS)
-    near, mean_near = _smooth(points, steps.astype(np.int64), NEAR_CELLS * reach_m)
-    _, mean_far = _smooth(points, steps.astype(np.int64), FAR_CELLS * reach_m)
-    mean = (near * mean_near + FEW * mean_far) / (near + FEW)
-    spacing: Values = _SMALLEST_M * np.exp2(mean / _STEPS)
-    return spacing
-
-
-def _smooth(points: Points, steps: Index, edge: float) -> tuple[Values, Values]:
-    """Return smoothed count and mean (n,) of `steps` (n,) over cells of `edge` metres."""
-    from dougong.kernels import protective as kernels
-
-    n = len(points)
-    cells = np.floor(points / edge).astype(np.int64)
-    axes = [np.unique(cells[:, axis]) for axis in range(3)]
-    sizes = [len(axis) for axis in axes]
-    at = [np.searchsorted(axis, cells[:, k]) for k, axis in enumerate(axes)]
-    keys, cell = np.unique((at[0] * sizes[1] + at[1]) * sizes[2] + at[2], return_inverse=True)
-    around = _around(keys, axes)
-    held = np.bincount(cell, minlength=len(keys))
-    sums = np.bincount(cell, weights=steps, minlength=len(keys)).astype(np.int64)
-    count, mean = np.empty(n), np.empty(n)
-    for_blocks(
-        n,
-        _BLOCK,
-        lambda start, stop: kernels.smooth_means(
-            points, edge, cell, around, held, sums, start, stop, count, mean
-        ),
-    )
-    return count, mean
-
-
-def _around(keys: Index, axes: list[Index]) -> Index:
-    """Return the places (m, 27) in `keys` (m,) of the cells round each cell; -1 where empty."""
-    sizes = [len(axis) for axis in axes]
-    at = (keys // (sizes[1] * sizes[2]), keys // sizes[2] % sizes[1], keys % sizes[2])
-    around = np.full((len(keys), 27), -1, np.int64)
-    for k in range(27):
-        found = np.ones(len(keys), bool)
-        key = np.zeros(len(keys), np.int64)
-        for axis, by in enumerate((k // 9 - 1, k // 3 % 3 - 1, k % 3 - 1)):
-            wanted = axes[axis][at[axis]] + by
-            place = np.minimum(np.searchsorted(axes[axis], wanted), sizes[axis] - 1)
-            found &= axes[axis][place] == wanted
-            key = key * sizes[axis] + place
-        place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
-        found &= keys[place] == key
-        around[found, k] = place[found]
-    return around
+    reach = reach_of(lambda: (eighth,), n) if reach_m is None else reach_m
+    if reach_m is None:
+        for_blocks(
+            n,
+            _BLOCK,
+            lambda start, stop: kernels.drop_far(index.points, places, reach**2, start, stop),
+        )
+    return places, np.minimum(eighth, reach) * math.sqrt(math.pi / TESTS), reach
 
 
 def _group_margin(
@@ -354,7 +287,7 @@ def _group_margin(
     kernels.link(points, places, frame, spacing, LINK, parent)
     held, sums = np.zeros(n, np.int64), np.zeros(n, np.int64)
     extents = np.empty((n, 6))
-    steps = np.rint(spacing / _SMALLEST_M * _STEPS).astype(np.int64)
+    steps = np.rint(spacing / SMALLEST_M * STEPS).astype(np.int64)
     kernels.measure(points, steps, parent, held, sums, extents)
     is_root = held > 0
     longest = np.zeros(n)
@@ -382,7 +315,7 @@ def _group_margin(
     gap = np.full(n, np.inf)
     np.minimum.at(gap, parent[asked], np.sqrt(gap2))
     root = parent[asked]
-    covered = sums[root] / held[root] * (_SMALLEST_M / _STEPS) * np.sqrt(held[root])
+    covered = sums[root] / held[root] * (SMALLEST_M / STEPS) * np.sqrt(held[root])
     size = np.maximum(covered, longest[root])
     margin[asked] = gap[root] / size
     return margin, groups

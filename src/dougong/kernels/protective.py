@@ -23,6 +23,25 @@ LINE = 8
 
 
 @kernel
+def drop_far(points: Floats, places: Small, limit2: float, start: int, stop: int) -> None:
+    """Set places (n, k) of neighbours beyond the limit to -1, for points start .. stop - 1.
+
+    Nearest first, so what follows one that is too far is too far as well.
+    """
+    for i in range(start, stop):
+        for k in range(places.shape[1] - 1, -1, -1):
+            j = places[i, k]
+            if j < 0:
+                continue
+            dx = points[j, 0] - points[i, 0]
+            dy = points[j, 1] - points[i, 1]
+            dz = points[j, 2] - points[i, 2]
+            if dx * dx + dy * dy + dz * dz <= limit2:
+                break
+            places[i, k] = -1
+
+
+@kernel
 def _covariance(points: Floats, places: Small, i: int, a: Floats) -> int:
     """Fill a (3, 3) with the covariance of point i and its neighbours; return how many they are."""
     held = 1
