@@ -80,7 +80,7 @@ def main() -> None:
         (folder / "out").mkdir()
         truth, entries = stations_of(asked, folder)
         project = Project.model_validate({"cloud": entries})
-        store = Store(folder / "work", is_temporary=True)
+        store = Store.beside(folder / "out")
         wall, cpu = time.perf_counter(), time.process_time()
         result = run(project, folder, folder / "out", store=store, progress=Silent())
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu

@@ -95,7 +95,7 @@ def network(tmp_path, monkeypatch):
         out = tmp_path / f"out{len(list(tmp_path.glob('out*')))}"
         out.mkdir()
         project = Project.model_validate({"cloud": entries})
-        store = Store(tmp_path / "work", is_temporary=True)
+        store = Store.beside(tmp_path / "project")
         return run(project, tmp_path, out, store=store, progress=Silent())
 
     return going
@@ -165,7 +165,7 @@ def test_two_clouds_have_no_network(network, tmp_path):
     entries = [{"name": n, "kind": "lidar", "files": [f"{n}.laz"]} for n in "ab"]
     network(neighbours)
     (tmp_path / "two").mkdir()
-    store = Store(tmp_path / "work", is_temporary=True)
+    store = Store.beside(tmp_path / "project")
     project = Project.model_validate({"cloud": entries})
     result = run(project, tmp_path, tmp_path / "two", store=store, progress=Silent())
     assert result["network"] is None

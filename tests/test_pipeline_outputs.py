@@ -135,18 +135,18 @@ def test_a_step_that_cannot_be_kept_is_one_sentence(tmp_path, monkeypatch):
     from dougong.pipeline.steps import Filtered
     from dougong.pipeline.store import Store
 
-    def full(path, **_):
-        path.write_bytes(b"half")
+    def full(file, **_):
+        file.write(b"half")
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("numpy.savez", full)
     codes = np.zeros(1, np.uint8)
     cloud = Cloud.from_points([[0.0, 0, 0]])
     step = Filtered(cloud=cloud, codes=codes, ground_class=codes, stages=())
-    store = Store(tmp_path / "work", is_temporary=True)
+    store = Store.beside(tmp_path / "out")
     with pytest.raises(OutputError, match=r"work could not be written: No space left.*--work"):
         store.save("key", step, ())
-    assert list((tmp_path / "work").iterdir()) == []
+    assert list((tmp_path / "out.work").iterdir()) == []
 
 
 def test_an_error_names_the_folder_that_the_user_named(tmp_path):

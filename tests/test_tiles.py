@@ -11,28 +11,16 @@ from dougong.cli import call
 from dougong.cloud import Cloud
 from dougong.errors import OutputError
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid, robust_box
-from dougong.formats import faults_of, read, write
-from dougong.pipeline import memory
+from dougong.formats import faults_of, read
 from dougong.threads import set_threads
 from dougong.tiles.cloud import read_arrays
 from dougong.tiles.engine import set_engine
+from dougong.tiles.folder import LocalFolder
 from dougong.tiles.grid import TileGrid, grid_for, part
 from dougong.tiles.partition import partition
 from dougong.tiles.spool import Spool
 from dougong.tiles.store import RowFile, Rows
-
-
-def site(count=30_000, seed=0, stray=True):
-    """A wall and ground with density 100:1, repeated places, and one point far away."""
-    rng = np.random.default_rng(seed)
-    wall = np.column_stack(
-        [rng.uniform(0, 8, count), 0.02 * rng.normal(size=count), 3 * rng.random(count) ** 3]
-    )
-    ground = np.column_stack([rng.uniform(-20, 20, (count // 4, 2)), np.zeros(count // 4)])
-    points = np.round(np.vstack([wall, ground, wall[:500]]), 3)
-    if stray:
-        points = np.vstack([points, [[1e6, -2e6, 40.0]]])
-    return Cloud.from_points(points, intensity=rng.integers(0, 9, len(points)).astype("<u2"))
+from tile_scans import KILLED, VOXEL, filtered_by, make_little_room, site, write_scan
 
 
 def pieces(cloud, size):
@@ -48,7 +36,7 @@ def test_tiles_keep_what_the_whole_keeps(tmp_path, params, chunk, tile_points):
     cloud = site()
     whole = octree_voxel_grid(cloud.xyz, params, records=cloud.records)
     spool = Spool(pieces(cloud, chunk), tmp_path)
-    tiled = partition(spool, params, tmp_path, tile_points, tile_points)
+    tiled = partition(spool, params, LocalFolder(tmp_path), tile_points, tile_points)
     row, xyz, count = joined(tiled)
     np.testing.assert_array_equal(row, np.flatnonzero(whole.is_kept))
     np.testing.assert_array_equal(xyz, cloud.xyz[whole.is_kept])
@@ -69,7 +57,7 @@ def joined(tiled):
 def test_one_voxel_with_more_points_than_a_tile_may_hold_ends(tmp_path):
     cloud = Cloud.from_points(np.full((5000, 3), 3.25))
     spool = Spool(pieces(cloud, 1000), tmp_path)
-    tiled = partition(spool, OctreeVoxelGrid(), tmp_path, 100, 100)
+    tiled = partition(spool, OctreeVoxelGrid(), LocalFolder(tmp_path), 100, 100)
     assert tiled.points == 1
     assert joined(tiled)[2].tolist() == [5000]
 
@@ -117,33 +105,12 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path):
 
 @pytest.fixture
 def scan(tmp_path):
-    """A LAZ file of a wall, ground and noise that the whole recipe has something to do with."""
-    rng = np.random.default_rng(3)
-    noise = rng.uniform([-20, -20, -3], [20, 20, 12], (400, 3))
-    points = np.vstack([site(stray=False).xyz + [20.0, 20.0, 0.0], noise + [20, 20, 0]])
-    path = tmp_path / "scan.laz"
-    write(Cloud.from_points(points + [5e5, 4e6, 100.0]), path)
-    return path
+    return write_scan(tmp_path / "scan.laz")
 
 
 @pytest.fixture
 def little_room(monkeypatch):
-    """Make 190 kB enough for tiles of some 3000 points and their halo."""
-    monkeypatch.setattr(memory, "BASE_BYTES", 0)
-    monkeypatch.setattr(memory, "BYTES_PER_POINT", 5)
-    monkeypatch.setattr(memory, "BYTES_PER_WAITING_POINT", 1)
-    monkeypatch.setattr(memory, "LEAST_TILE_POINTS", 100)
-    monkeypatch.setattr(memory, "_BYTES_PER_BOOKED_POINT", 2)
-    monkeypatch.setattr(memory, "_BYTES_PER_TILE_POINT", 12)
-
-
-VOXEL = "octree_voxel_grid.voxel_m=0.1"
-
-
-def filtered_by(path, out, *options):
-    voxel = ("--set", VOXEL) if {"lidar", "octree_voxel_grid"} & set(options) else ()
-    assert call(["filter", str(path), str(out), *voxel, "--quiet", *options]) == 0
-    return read(out), json.loads((out.parent / f"{out.name}.json").read_text())
+    make_little_room(monkeypatch)
 
 
 @pytest.mark.parametrize(
@@ -198,28 +165,6 @@ def test_a_dask_cluster_gives_the_same(scan, tmp_path, little_room):
         set_engine("local")
         set_threads(2)
     np.testing.assert_array_equal(tiled.records, whole.records)
-
-
-KILLED = """
-import os, sys
-from dougong.cli import call
-from dougong.pipeline import memory
-from dougong.tiles import engine
-
-memory.BASE_BYTES, memory.BYTES_PER_POINT, memory.LEAST_TILE_POINTS = 0, 5, 100
-memory._BYTES_PER_BOOKED_POINT, memory._BYTES_PER_TILE_POINT = 2, 12
-left, perform = int(sys.argv[1]), engine.perform
-
-def counted(task):
-    global left
-    left -= 1
-    if left < 0:
-        os.kill(os.getpid(), 9)
-    return perform(task)
-
-engine.perform = counted
-sys.exit(call(sys.argv[2:]))
-"""
 
 
 def test_a_killed_run_goes_on_where_it_was(scan, tmp_path, little_room):

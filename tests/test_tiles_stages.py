@@ -12,6 +12,7 @@ from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
 from dougong.filters.selection import Reason, details_of
 from dougong.tiles.cloud import load_tiles, read_arrays
 from dougong.tiles.engine import local_engine
+from dougong.tiles.folder import LocalFolder
 from dougong.tiles.partition import partition
 from dougong.tiles.spool import Spool
 from dougong.tiles.stages import TileBench
@@ -50,7 +51,7 @@ def tiled(points, folder, most, grid=None, chunk=1111):
         whole.select(np.arange(a, min(a + chunk, len(points))))
         for a in range(0, len(points), chunk)
     )
-    return partition(Spool(pieces, folder), grid, folder, most, most), whole
+    return partition(Spool(pieces, folder), grid, LocalFolder(folder), most, most), whole
 
 
 def states(bench, points):
@@ -102,7 +103,9 @@ def kept_places(points, folder, most, steps=RECIPE):
         for name, values, among in steps:
             bench.apply(name, FILTERS[name].params(**values), among)
     is_kept = states(bench, len(points))["code"] == Reason.KEPT
-    rows = np.concatenate([read_arrays(folder, t, "points", "row")["row"] for t in cloud.tiles])
+    rows = np.concatenate(
+        [read_arrays(cloud.folder, t, "points", "row")["row"] for t in cloud.tiles]
+    )
     chosen = np.zeros(len(points), bool)
     chosen[rows] = True
     kept = whole.xyz[is_kept & chosen] + whole.frame.origin
@@ -124,7 +127,7 @@ def test_finished_tiles_are_not_done_again(tmp_path, monkeypatch):
     from dougong.tiles import engine as engines
 
     kept_places(site(1), tmp_path, 1500)
-    cloud = load_tiles(tmp_path)
+    cloud = load_tiles(LocalFolder(tmp_path))
     done, perform = [], engines.perform
     monkeypatch.setattr(engines, "perform", lambda task: done.append(task.work) or perform(task))
 

@@ -143,12 +143,13 @@ def filter_file(
     mark: bool,
     settings: Sequence[str],
     overwrite: bool,
-    work: Path | None = None,
+    work: str | None = None,
     memory_bytes: int | None,
     progress: Progress,
 ) -> Document:
     """Filter one file into another; see `dougong.pipeline.filtering.filter_file`."""
     from dougong.pipeline import filtering
+    from dougong.tiles.folder import folder_of
 
     _say_if_cold(progress)
     return filtering.filter_file(
@@ -159,7 +160,7 @@ def filter_file(
         overwrite=overwrite,
         memory_bytes=memory_bytes,
         progress=progress,
-        work=work,
+        work=None if work is None else folder_of(work),
     )
 
 
@@ -252,7 +253,7 @@ def run_project(
     full_resolution: bool,
     merge: str | None,
     overwrite: bool,
-    work: Path | None,
+    work: str | None,
     memory_bytes: int | None,
     progress: Progress,
 ) -> Document:
@@ -275,7 +276,7 @@ def run_project(
         refuse_full_disk(files, out)
     _say_if_cold(progress)
     store, room = _store(out, work), Room.of(memory_bytes)
-    refuse_or_announce(asked, folder, room, store.folder, progress)
+    refuse_or_announce(asked, folder, room, store.scratch, progress)
     with result_folder(out) as part:
         document = run(asked, folder, part, store=store, progress=progress, room=room)
         _build_report(part, progress)
@@ -309,7 +310,7 @@ def demo(
     seed: int,
     size: str,
     overwrite: bool,
-    work: Path | None,
+    work: str | None,
     memory_bytes: int | None,
     progress: Progress,
 ) -> Document:
@@ -346,13 +347,14 @@ def _named(out: Path) -> Path:
     return out if out.name not in ("", "..") else out.resolve()
 
 
-def _store(out: Path, work: Path | None) -> Store:
+def _store(out: Path, work: str | None) -> Store:
     """Return where finished filter steps are kept: ``--work``, else a folder beside `out`."""
     from dougong.pipeline.store import Store
+    from dougong.tiles.folder import folder_of
 
     if work is not None:
-        return Store(work, is_temporary=False)
-    return Store(out.with_name(f"{out.name}.work"), is_temporary=True)
+        return Store.kept(folder_of(work), out)
+    return Store.beside(out)
 
 
 def _say_if_cold(progress: Progress) -> None:

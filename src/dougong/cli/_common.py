@@ -31,8 +31,9 @@ class Common:
     engine: Annotated[str, Parameter(group=GLOBAL)] = "local"
     """Who works on the tiles of clouds larger than memory: local, dask (processes of this machine)
     or dask://HOST:PORT."""
-    work: Annotated[Path | None, Parameter(group=GLOBAL)] = None
-    """Folder for finished steps, so that a cancelled run goes on; default: beside the output."""
+    work: Annotated[str | None, Parameter(group=GLOBAL)] = None
+    """Folder for finished steps and tiles, so that a cancelled run goes on, or s3://BUCKET/PREFIX;
+    default: beside the output."""
     seed: Annotated[int, Parameter(group=GLOBAL)] = 0
     """Seed of everything random."""
     debug: Annotated[bool, Parameter(group=GLOBAL, negative="", show_default=False)] = False
@@ -61,6 +62,19 @@ class Common:
             )
             raise InputError(msg)
         return size
+
+    def local_work(self) -> Path | None:
+        """Return ``--work`` for a command whose temporary files are on a disk.
+
+        Raises
+        ------
+        InputError
+            It is a URL.
+        """
+        if self.work is not None and "://" in self.work:
+            msg = f"--work of this command is a folder on a disk, got {self.work!r}. Name a folder."
+            raise InputError(msg)
+        return None if self.work is None else Path(self.work)
 
     def check(self) -> None:
         """Refuse what this version cannot do.

@@ -48,7 +48,7 @@ def command(
             threads=common.threads,
             repeats=repeats,
             seed=common.seed,
-            work=common.work,
+            work=common.local_work(),
             overwrite=overwrite,
             progress=progress,
         )

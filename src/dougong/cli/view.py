@@ -54,7 +54,7 @@ def command(
             paths,
             port=port,
             open_browser=browser,
-            work=common.work,
+            work=common.local_work(),
             progress=progress,
             pairs=pairs,
         )

@@ -121,7 +121,7 @@ def _result(surveyed: Surveyed, folder: Path, progress: Progress) -> dict[str, A
         project.model_copy(update={"project": head}),
         folder,
         out,
-        store=Store(folder / "work", is_temporary=True),
+        store=Store.beside(out),
         progress=progress,
     )
 

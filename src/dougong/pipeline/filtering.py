@@ -47,11 +47,11 @@ from dougong.pipeline.store import Books
 from dougong.pipeline.tiled import (
     TiledJob,
     filter_chunks,
-    forget_tiles,
     is_too_large,
     stations_of,
     tiled_job,
 )
+from dougong.tiles.folder import Folder, LocalFolder, copies_in
 from dougong.typing import Kind
 
 Document = dict[str, Any]
@@ -122,7 +122,7 @@ def filter_file(
     overwrite: bool,
     memory_bytes: int | None,
     progress: Progress,
-    work: Path | None = None,
+    work: Folder | None = None,
 ) -> Document:
     """Filter one file into another and write its books beside it (``OUTPUT.json``).
 
@@ -142,14 +142,14 @@ def filter_file(
     with clock.measure("read"):
         digest = sha256(input)
     room = Room.of(memory_bytes)
-    with _scratch(output, work, f"{digest} {job.tiled().grid!r} in {room.bytes:.0f}") as scratch:
+    with _places(output, work, f"{digest} {job.tiled().grid!r} in {room.bytes:.0f}") as places:
         result: Cloud | Pieces
         hold: Hold | None = None
         filtered: Filtered | Books
         if is_too_large(input, room, 0):
             progress.note(f"{input.name} is larger than memory: it is filtered on tiles")
             with clock.measure("filter"):
-                filtered = _filtered_on_tiles(input, job, room, scratch, progress)
+                filtered = _filtered_on_tiles(input, job, room, places, progress)
             noticed = filtered.noticed
             hold = Hold(room.tile_points(len(filtered.codes), 0), output.parent)
             result = _pieces(input, job, filtered, mark)
@@ -180,17 +180,20 @@ def filter_file(
 
 
 @contextmanager
-def _scratch(output: Path, work: Path | None, facts: str) -> Iterator[Path]:
-    """Yield a folder for tiles: in `work`, named by what they depend on, or one that goes again."""
-    if work is not None:
-        told = f"{dougong.__version__} {facts}"
-        yield work / f"tiles-{hashlib.sha256(told.encode()).hexdigest()[:16]}"
-        return
-    folder = output.with_name(f"tiles-{output.name}-{os.getpid()}")
+def _places(output: Path, work: Folder | None, facts: str) -> Iterator[tuple[Folder, Path]]:
+    """Yield a folder for tiles, and one on a disk for what is of use while they are cut.
+
+    The tiles' is in `work`, named by what they depend on; what is beside the output goes again.
+    """
+    beside = LocalFolder(output.with_name(f"tiles-{output.name}-{os.getpid()}"))
+    told = f"{dougong.__version__} {facts}"
+    name = f"tiles-{hashlib.sha256(told.encode()).hexdigest()[:16]}"
+    folder = beside if work is None else work / name
     try:
-        yield folder
+        with copies_in(beside.path / "copies"):
+            yield folder, folder.local or beside.path / "cut"
     finally:
-        forget_tiles(folder)
+        beside.remove()
 
 
 def _pieces(input: Path, job: FilterJob, books: Books, mark: bool) -> Pieces:
@@ -238,7 +241,7 @@ def _filter_document(
 
 
 def _filtered_on_tiles(
-    input: Path, job: FilterJob, room: Room, scratch: Path, progress: Progress
+    input: Path, job: FilterJob, room: Room, places: tuple[Folder, Path], progress: Progress
 ) -> Books:
     (chunks,) = stations_of(input, split=False)
     return filter_chunks(
@@ -247,7 +250,8 @@ def _filtered_on_tiles(
         points=describe(input).points,
         room=room,
         waiting=0,
-        scratch=scratch,
+        folder=places[0],
+        scratch=places[1],
         progress=progress,
     )
 

@@ -25,7 +25,6 @@ from dougong.pipeline.steps import Filtered
 from dougong.pipeline.store import Books, Store
 from dougong.pipeline.tiled import (
     filter_chunks,
-    forget_tiles,
     is_too_large,
     stations_of,
     tiled_job,
@@ -157,7 +156,8 @@ class Loader:
             if self.store.load(key) is not None:
                 self._say_known(file.stem)
                 continue
-            scratch = self.store.folder / f"tiles-{self._tiles_key(entry, digest, station)}"
+            name = f"tiles-{self._tiles_key(entry, digest, station)}"
+            folder, scratch = self.store.folder / name, self.scratch / name
             with self.clock.measure("filter"):
                 books = filter_chunks(
                     (self._placed(entry, chunk) for chunk in raw),
@@ -165,12 +165,13 @@ class Loader:
                     points=points,
                     room=self.room,
                     waiting=self.waiting,
+                    folder=folder,
                     scratch=scratch,
                     progress=self.progress,
                 )
             self.store.save(key, books, books.noticed)
             if self.store.is_temporary:
-                forget_tiles(scratch)
+                folder.remove()
         for station, raw in enumerate(stations_of(file, split=not entry.registered)):
             key = self._key(entry, digest, station)
             known = self.store.load(key)

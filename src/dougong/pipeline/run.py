@@ -36,6 +36,7 @@ from dougong.pipeline.scaling import load_all
 from dougong.pipeline.store import Store
 from dougong.pipeline.writing import write_clouds, write_registrations
 from dougong.registration.control_solve import ControlPoints
+from dougong.tiles.folder import copies_in
 
 _WORST = ("failed", "ambiguous", "ok")
 
@@ -73,7 +74,7 @@ def run(
     dict
         The document of result.json.
     """
-    with scratch_folder(store.folder / "run") as scratch:
+    with scratch_folder(store.scratch / "run") as scratch, copies_in(scratch / "copies"):
         loader = Loader(
             folder=folder,
             recipe=project.filter,

@@ -17,11 +17,12 @@ from dougong.tiles.cloud import (
     POINTS,
     Tile,
     TiledCloud,
-    path_of,
+    name_of,
     read_arrays,
     tile_of,
     write_arrays,
 )
+from dougong.tiles.folder import LocalFolder
 from dougong.tiles.grid import grid_for
 from dougong.tiles.spool import Spool
 from dougong.typing import Index, Points
@@ -86,7 +87,7 @@ def cut(sets: tuple[Iterable[Points], Iterable[Points]], folder: Path, most: int
                 counts[side] += len(xyz)
                 yield Cloud(xyz=xyz, records=records, frame=Frame())
 
-    spool = Spool(clouds(), folder)
+    spool, kept = Spool(clouds(), folder), LocalFolder(folder)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for block in spool.blocks():
         lowest, highest = corners_of(block)
@@ -97,10 +98,10 @@ def cut(sets: tuple[Iterable[Points], Iterable[Points]], folder: Path, most: int
         rows = file.read()
         tile = tile_of(file.path.stem, rows.xyz)
         arrays = {"xyz": rows.xyz, **{name: rows.records[name] for name in ("side", "row")}}
-        write_arrays(path_of(folder, tile, POINTS), arrays, {})
+        write_arrays(kept, name_of(tile, POINTS), arrays, {})
         file.remove()
         tiles.append(tile)
-    cloud = TiledCloud(folder, tuple(tiles), {})
+    cloud = TiledCloud(kept, tuple(tiles), {})
     return lambda halo_m: (_sides(cloud, tile, halo_m) for tile in cloud.tiles)
 
 

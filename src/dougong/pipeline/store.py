@@ -6,10 +6,8 @@ registration setting therefore does not filter again, and a changed filter setti
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,11 +17,10 @@ from numpy.typing import NDArray
 
 import dougong
 from dougong.cloud import Cloud
-from dougong.errors import OutputError
 from dougong.filters.selection import Reason
 from dougong.params import Parameters
-from dougong.pipeline.outputs import write_text
 from dougong.pipeline.steps import Filtered, StageCount
+from dougong.tiles.folder import Folder, LocalFolder
 from dougong.typing import Kind
 
 _ALWAYS = ("codes", "ground_class")
@@ -66,11 +63,24 @@ class Books:
 
 
 class Store:
-    """A folder of finished steps."""
+    """A folder of finished steps, and of what only the run that goes on needs."""
 
-    def __init__(self, folder: Path, *, is_temporary: bool) -> None:
+    def __init__(self, folder: Folder, scratch: Path, *, is_temporary: bool) -> None:
         self.folder = folder
+        self.scratch = scratch
+        """On a disk of this machine."""
         self.is_temporary = is_temporary
+
+    @classmethod
+    def beside(cls, out: Path) -> "Store":
+        """Return one beside the result, which is deleted once the run is done."""
+        scratch = out.with_name(f"{out.name}.work")
+        return cls(LocalFolder(scratch), scratch, is_temporary=True)
+
+    @classmethod
+    def kept(cls, folder: Folder, out: Path) -> "Store":
+        """Return one in a folder that stays; where that is on no disk, scratch is beside `out`."""
+        return cls(folder, folder.local or cls.beside(out).scratch, is_temporary=False)
 
     def key(self, digest: str, station: int, kind: Kind, params: Parameters) -> str:
         """Return the name of a step: a hash of everything its result depends on."""
@@ -79,15 +89,15 @@ class Store:
 
     def load(self, key: str) -> Books | None:
         """Return the books of a finished step, or None."""
-        books = self.folder / f"{key}.json"
-        arrays = self.folder / f"{key}.npz"
-        # The books are written last: where they are, the arrays are whole.
-        if not books.is_file() or not arrays.is_file():
+        try:
+            # The books are written last: where they are, the arrays are whole.
+            with self.folder.open(f"{key}.json") as file:
+                told = json.load(file)
+            with self.folder.open(f"{key}.npz") as file, np.load(file) as stored:
+                codes, ground = stored["codes"], stored["ground_class"]
+                details = {name: stored[name] for name in stored.files if name not in _ALWAYS}
+        except FileNotFoundError:
             return None
-        told = json.loads(books.read_text(encoding="utf-8"))
-        with np.load(arrays) as stored:
-            codes, ground = stored["codes"], stored["ground_class"]
-            details = {name: stored[name] for name in stored.files if name not in _ALWAYS}
         return Books(
             codes=codes,
             ground_class=ground,
@@ -105,32 +115,20 @@ class Store:
         OutputError
             The disk is full or the folder cannot be written.
         """
-        part = self.folder / f"{key}.part-{os.getpid()}.npz"
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            arrays: dict[str, Any] = {
-                "codes": filtered.codes,
-                "ground_class": filtered.ground_class,
-                **filtered.details,
-            }
-            np.savez(part, **arrays)
-            part.replace(self.folder / f"{key}.npz")
-        except OSError as error:
-            with suppress(OSError):
-                part.unlink()
-            msg = (
-                f"{self.folder} could not be written: {error.strerror or error}. "
-                "Free some space or pass another --work."
-            )
-            raise OutputError(msg) from error
+        arrays: dict[str, Any] = {
+            "codes": filtered.codes,
+            "ground_class": filtered.ground_class,
+            **filtered.details,
+        }
+        self.folder.write(f"{key}.npz", lambda file: np.savez(file, **arrays))
         books = {
             "stages": [asdict(stage) for stage in filtered.stages],
             "notes": list(filtered.notes),
             "noticed": list(noticed),
         }
-        write_text(self.folder / f"{key}.json", json.dumps(books))
+        self.folder.write(f"{key}.json", lambda file: file.write(json.dumps(books).encode()))
 
     def finish(self) -> None:
-        """Forget everything once the run is done, unless the user named the folder."""
-        if self.is_temporary:
-            shutil.rmtree(self.folder, ignore_errors=True)
+        """Forget everything once the run is done, or what is not in the folder that stays."""
+        if self.is_temporary or self.folder.local is None:
+            shutil.rmtree(self.scratch, ignore_errors=True)

@@ -30,6 +30,7 @@ from dougong.pipeline.steps import StageCount, Step, doubts, nothing_kept
 from dougong.pipeline.store import Books
 from dougong.tiles.cloud import POINTS, TiledCloud, load_tiles, read_arrays
 from dougong.tiles.engine import engine_in_use
+from dougong.tiles.folder import Folder
 from dougong.tiles.partition import partition
 from dougong.tiles.spool import Spool
 from dougong.tiles.stages import TileBench
@@ -116,6 +117,7 @@ def filter_chunks(
     points: int,
     room: Room,
     waiting: int,
+    folder: Folder,
     scratch: Path,
     progress: Progress,
 ) -> Books:
@@ -131,9 +133,10 @@ def filter_chunks(
     room : Room
     waiting : int
         Points of clouds that are held meanwhile.
+    folder : Folder
+        Gets the tiles. Those that an earlier run left there are gone on with.
     scratch : Path
-        Gets the cloud, once as decoded and once in tiles. Tiles that an earlier run left there
-        are gone on with.
+        Gets the cloud while it is cut, twice over; may be the same folder.
     progress : Progress
 
     Raises
@@ -141,15 +144,15 @@ def filter_chunks(
     InputError
         Even tiles do not fit, or no point is left.
     FormatError, OutputError, TileError
-        The file cannot be read, `scratch` cannot be written (a full disk), a tile failed.
+        The file cannot be read, a folder cannot be written (a full disk), a tile failed.
     """
     start = time.perf_counter()
     with engine_in_use() as engine:
-        tiles = load_tiles(scratch)
+        tiles = load_tiles(folder)
         if tiles is None:
             most = room.tile_points(points, waiting)
             kept = max(most // (HALO_SHARE * engine.width), 1)
-            tiles = _cut(chunks, job, most, kept, scratch, progress)
+            tiles = _cut(chunks, job, most, kept, (folder, scratch), progress)
         name = tiles.facts["name"]
         stages = [_grid_stage(tiles, time.perf_counter() - start)] if job.grid is not None else []
         bench = TileBench(tiles, engine)
@@ -189,11 +192,13 @@ def _cut(
     job: TiledJob,
     most: int,
     most_kept: int,
-    scratch: Path,
+    places: tuple[Folder, Path],
     progress: Progress,
 ) -> TiledCloud:
-    """Write the cloud to `scratch`, thin it where the job begins with a grid, and cut it."""
+    """Spool the cloud, thin it where the job begins with a grid, and cut it."""
+    folder, scratch = places
     # What a killed run left is of no use before its last file, the list of tiles.
+    folder.remove()
     shutil.rmtree(scratch, ignore_errors=True)
     spool = Spool(chunks, scratch)
     require_metric(spool.first)
@@ -205,7 +210,7 @@ def _cut(
         "notes": list(first.notes),
         "origin": first.frame.origin.tolist(),
     }
-    return partition(spool, job.grid, scratch, most, most_kept, told)
+    return partition(spool, job.grid, folder, most, most_kept, told)
 
 
 def _grid_stage(tiles: TiledCloud, seconds: float) -> StageCount:
@@ -241,8 +246,3 @@ def _books(
         noticed=tuple(noticed),
         details=details,
     )
-
-
-def forget_tiles(folder: Path) -> None:
-    """Delete the tiles in `folder`."""
-    shutil.rmtree(folder, ignore_errors=True)

@@ -1,21 +1,20 @@
 """A cloud on disk as tiles: what every tile holds, and what stages of work have said of it.
 
 A tile is a few files in one folder: its points, then one file per finished stage, named by the
-stage's key. Files are written beside and renamed, so a file that is there is whole.
+stage's key. A file that is there is whole, see `Folder`.
 """
 
 import json
-import os
-from collections.abc import Callable, Iterator, Mapping
+import zipfile
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dougong._boxes import corners_of
-from dougong.errors import OutputError
+from dougong.tiles.folder import Folder
 from dougong.typing import Points
 
 Arrays = dict[str, NDArray[Any]]
@@ -47,7 +46,7 @@ class Tile(NamedTuple):
 class TiledCloud:
     """The tiles of one cloud in `folder`."""
 
-    folder: Path
+    folder: Folder
     tiles: tuple[Tile, ...]
     facts: Mapping[str, Any]
     """What was learnt while the cloud was cut, as plain data."""
@@ -68,15 +67,16 @@ class TiledCloud:
     def save(self) -> None:
         """Write down that the tiles are whole."""
         told = {"tiles": self.tiles, "facts": dict(self.facts)}
-        _replace(self.folder / INDEX, lambda part: part.write_text(json.dumps(told), "utf-8"))
+        self.folder.write(INDEX, lambda file: file.write(json.dumps(told).encode()))
 
 
-def load_tiles(folder: Path) -> TiledCloud | None:
+def load_tiles(folder: Folder) -> TiledCloud | None:
     """Return the tiles that an earlier run left whole in `folder`, or None."""
-    index = folder / INDEX
-    if not index.is_file():
+    try:
+        with folder.open(INDEX) as file:
+            told = json.load(file)
+    except FileNotFoundError:
         return None
-    told = json.loads(index.read_text(encoding="utf-8"))
     tiles = (Tile(name, n, tuple(low), tuple(high)) for name, n, low, high in told["tiles"])
     return TiledCloud(folder, tuple(tiles), told["facts"])
 
@@ -87,27 +87,40 @@ def tile_of(name: str, xyz: Points) -> Tile:
     return Tile(name, len(xyz), tuple(low.tolist()), tuple(high.tolist()))
 
 
-def path_of(folder: Path, tile: Tile, stage: str) -> Path:
-    """Return the file of one stage of a tile."""
-    return folder / f"{tile.name}.{stage}.npz"
+def name_of(tile: Tile, stage: str) -> str:
+    """Return the name of the file of one stage of a tile."""
+    return f"{tile.name}.{stage}.npz"
 
 
-def read_arrays(folder: Path, tile: Tile, stage: str, *names: str) -> Arrays:
+def read_arrays(folder: Folder, tile: Tile, stage: str, *names: str) -> Arrays:
     """Return the arrays `names` of a stage, or all of them."""
-    with np.load(path_of(folder, tile, stage)) as stored:
+    return read_file(folder, name_of(tile, stage), *names)
+
+
+def read_file(folder: Folder, file_name: str, *names: str) -> Arrays:
+    """Return the arrays `names` of a file, or all of them."""
+    with folder.open(file_name) as file, np.load(file) as stored:
         return {name: stored[name] for name in names or stored.files if name != _RECORD}
 
 
-def read_record(path: Path) -> Record | None:
-    """Return what a finished stage of a tile recorded; None where it is not finished."""
-    if not path.is_file():
+def read_record(folder: Folder, file_name: str) -> Record | None:
+    """Return what a finished stage recorded; None where it is not finished."""
+    try:
+        # The record is the last of what is in the file, so its end is enough.
+        with (
+            folder.open_end(file_name) as file,
+            zipfile.ZipFile(file) as stored,
+            stored.open(f"{_RECORD}.npy") as member,
+        ):
+            record: Record = json.loads(str(np.lib.format.read_array(member)))
+    except FileNotFoundError:
         return None
-    with np.load(path) as stored:
-        record: Record = json.loads(str(stored[_RECORD]))
     return record
 
 
-def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], record: Record) -> None:
+def write_arrays(
+    folder: Folder, file_name: str, arrays: Mapping[str, NDArray[Any]], record: Record
+) -> None:
     """Write a stage of a tile.
 
     Raises
@@ -116,23 +129,4 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], record: Record)
         The disk is full or the folder cannot be written.
     """
     told: dict[str, Any] = {**arrays, _RECORD: np.array(json.dumps(record))}
-
-    def write(part: Path) -> None:
-        with part.open("wb") as file:
-            np.savez(file, **told)
-
-    _replace(path, write)
-
-
-def _replace(path: Path, write: Callable[[Path], Any]) -> None:
-    part = path.with_name(f"{path.name}.part-{os.getpid()}")
-    try:
-        write(part)
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        msg = (
-            f"{path.parent} could not be written: {error.strerror or error}. "
-            "Free some space or pass another --work."
-        )
-        raise OutputError(msg) from error
+    folder.write(file_name, lambda file: np.savez(file, **told))

@@ -10,12 +10,12 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExec
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 from dougong.errors import DougongError, InputError, OutputError, TileError
 from dougong.threads import get_threads, set_threads
 from dougong.tiles.cloud import Arrays, Record, read_record, write_arrays
+from dougong.tiles.folder import Folder
 
 _TRIES = 2
 
@@ -25,7 +25,8 @@ class Task:
     """Work on one tile; everything in it travels to whoever does it."""
 
     tile: str
-    done: Path
+    folder: Folder
+    done: str
     """The file that it writes, last and whole: where it is, the task is finished."""
     work: Callable[[Any], tuple[Arrays, Record]]
     """A function of a module, so that another process can import it."""
@@ -34,11 +35,11 @@ class Task:
 
 def perform(task: Task) -> Record:
     """Do a task and return its record."""
-    known = read_record(task.done)
+    known = read_record(task.folder, task.done)
     if known is not None:
         return known
     arrays, record = task.work(task.job)
-    write_arrays(task.done, arrays, record)
+    write_arrays(task.folder, task.done, arrays, record)
     return record
 
 
@@ -58,9 +59,10 @@ class Engine:
             Some failed twice; the others are done and kept.
         """
         records: dict[int, Record] = {}
+        there = {name for folder in {task.folder for task in tasks} for name in folder.names()}
         waiting: list[tuple[int, int]] = []
         for number, task in reversed(list(enumerate(tasks))):
-            known = read_record(task.done)
+            known = read_record(task.folder, task.done) if task.done in there else None
             if known is None:
                 waiting.append((number, 1))
             else:

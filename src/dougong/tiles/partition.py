@@ -5,7 +5,6 @@ those of the whole cloud.
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,10 +17,11 @@ from dougong.formats.faults import (
     robust_box,
     sample_step,
 )
-from dougong.tiles.cloud import POINTS, Tile, TiledCloud, path_of, tile_of, write_arrays
+from dougong.tiles.cloud import POINTS, Tile, TiledCloud, name_of, tile_of, write_arrays
+from dougong.tiles.folder import Folder
 from dougong.tiles.grid import grid_for
 from dougong.tiles.spool import Spool, cut
-from dougong.tiles.store import RowFile, Rows, make_row_file
+from dougong.tiles.store import RowFile, Rows
 from dougong.typing import Points
 
 _COUNT = np.dtype([("voxel_count", "<i4")])
@@ -30,7 +30,7 @@ _COUNT = np.dtype([("voxel_count", "<i4")])
 def partition(
     spool: Spool,
     params: OctreeVoxelGrid | None,
-    folder: Path,
+    folder: Folder,
     most: int,
     most_kept: int,
     told: Mapping[str, Any] | None = None,
@@ -40,10 +40,10 @@ def partition(
     Parameters
     ----------
     spool : Spool
-        Used up.
+        Used up. What grows by appending stays on its disk.
     params : OctreeVoxelGrid or None
         None keeps every point.
-    folder : Path
+    folder : Folder
     most : int
         At most so many points are decimated at once.
     most_kept : int
@@ -58,8 +58,7 @@ def partition(
     """
     root = root_cube_of(spool.blocks, spool.points, params or OctreeVoxelGrid())
     sample, far = _sample_and_far(spool)
-    make = make_row_file(folder)
-    kept = make("kept", _COUNT)
+    kept = spool.make("kept", _COUNT)
     copies = points = 0
     grid = grid_for(root.low, root.edge_m, root.voxel_m, spool.points, most)
     for part in spool.cut(grid, most):
@@ -72,7 +71,7 @@ def partition(
     grid = grid_for(root.low, root.edge_m, root.voxel_m, points, most_kept)
     tiles = tuple(
         _saved(part, folder, is_decimated=params is not None)
-        for part in cut(kept, grid, most_kept, make)
+        for part in cut(kept, grid, most_kept, spool.make)
     )
     faults = faults_in_words(
         spool.first.frame, points=spool.points, copies=copies, far=far, sample=sample
@@ -100,7 +99,7 @@ def _chosen(rows: Rows, params: OctreeVoxelGrid | None, root: Root) -> Rows:
     return Rows(rows.row, rows.xyz, counts).take(selection.is_kept)
 
 
-def _saved(part: RowFile, folder: Path, *, is_decimated: bool) -> Tile:
+def _saved(part: RowFile, folder: Folder, *, is_decimated: bool) -> Tile:
     """Write a tile in the order of the cloud, and return it."""
     rows = part.read()
     rows = rows.take(np.argsort(rows.row))
@@ -108,6 +107,6 @@ def _saved(part: RowFile, folder: Path, *, is_decimated: bool) -> Tile:
     arrays = {"xyz": rows.xyz, "row": rows.row}
     if is_decimated:
         arrays["voxel_count"] = rows.records["voxel_count"].copy()
-    write_arrays(path_of(folder, tile, POINTS), arrays, {})
+    write_arrays(folder, name_of(tile, POINTS), arrays, {})
     part.remove()
     return tile

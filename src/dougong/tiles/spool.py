@@ -16,13 +16,13 @@ class Spool:
 
     def __init__(self, clouds: Iterable[Cloud], folder: Path) -> None:
         """Write `clouds`, which share one frame and one layout, to `folder`."""
-        self._make = make_row_file(folder)
+        self.make = make_row_file(folder)
         self.points = 0
         self._file: RowFile | None = None
         for cloud in clouds:
             if self._file is None:
                 self.first = cloud.select(np.arange(0))
-                self._file = self._make("spool", cloud.records.dtype)
+                self._file = self.make("spool", cloud.records.dtype)
             rows = np.arange(self.points, self.points + len(cloud))
             self._file.append(Rows(rows, cloud.xyz, cloud.records))
             self.points += len(cloud)
@@ -39,7 +39,7 @@ class Spool:
     def cut(self, grid: TileGrid, most: int) -> Iterator[RowFile]:
         """Cut the cloud into tiles, see `cut`. The spool is used up."""
         assert self._file is not None
-        yield from cut(self._file, grid, most, self._make)
+        yield from cut(self._file, grid, most, self.make)
 
 
 def cut(file: RowFile, grid: TileGrid, most: int, make: RowFileMaker) -> Iterator[RowFile]:

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,7 @@ from dougong.tiles.cloud import (
     Arrays,
     Record,
     TiledCloud,
-    path_of,
+    name_of,
     read_arrays,
     read_record,
     write_arrays,
@@ -108,7 +107,7 @@ class _Stage:
 
     def map(self, name: str, do: Work, known: Any = None) -> tuple[list[Record], str]:
         """Run `do` on every tile; return the records and the key of the step."""
-        key = self.key(name, str(known) if isinstance(known, Path) else repr(known))
+        key = self.key(name, repr(known))
         job = partial(
             Job,
             before=self.before,
@@ -119,7 +118,7 @@ class _Stage:
         )
         folder = self.cloud.folder
         tasks = [
-            Task(tile.name, path_of(folder, tile, key), do, job(folder, tile))
+            Task(tile.name, folder, name_of(tile, key), do, job(folder, tile))
             for tile in self.cloud.tiles
         ]
         return self.engine.run(tasks), key
@@ -140,14 +139,14 @@ class _Stage:
         folder, tiles = self.cloud.folder, self.cloud.tiles
         return lambda: (read_arrays(folder, tile, stage, name)[name] for tile in tiles)
 
-    def kept(self, name: str, make: Callable[[int], tuple[Arrays, Record]]) -> tuple[Path, Record]:
+    def kept(self, name: str, make: Callable[[int], tuple[Arrays, Record]]) -> tuple[str, Record]:
         """Return the file, and the record, of what `make` finds of the whole cloud."""
-        path = self.cloud.folder / f"whole.{self.key(name)}.npz"
-        record = read_record(path)
+        file, folder = f"whole.{self.key(name)}.npz", self.cloud.folder
+        record = read_record(folder, file)
         if record is None:
             arrays, record = make(self.asked)
-            write_arrays(path, arrays, record)
-        return path, record
+            write_arrays(folder, file, arrays, record)
+        return file, record
 
 
 Outcome = tuple[list[Record], tuple[str, ...], str]
@@ -164,8 +163,8 @@ def _low_outliers(stage: _Stage) -> Outcome:
     def make(asked: int) -> tuple[Arrays, Record]:
         return _packed(find_levels(stage.blocks, asked, params)._asdict()), {}
 
-    path, _ = stage.kept("levels", make)
-    records, key = stage.map("low_outliers", work.judge_low, path)
+    file, _ = stage.kept("levels", make)
+    records, key = stage.map("low_outliers", work.judge_low, file)
     return records, low_notes(_sum(records, "taken"), _sum(records, "asked")), key
 
 
@@ -177,8 +176,8 @@ def _cloth(stage: _Stage) -> Outcome:
         cloth, low = guarded_cloth(stage.blocks, asked, params)
         return _packed({name: getattr(cloth, name) for name in cloth.__slots__}), {"low": low}
 
-    path, record = stage.kept("cloth", make)
-    records, key = stage.map("cloth_simulation", work.judge_cloth, path)
+    file, record = stage.kept("cloth", make)
+    records, key = stage.map("cloth_simulation", work.judge_cloth, file)
     notes = cloth_notes(record["low"], _sum(records, "lost"), _sum(records, "asked"))
     return records, notes, key
 

@@ -4,10 +4,9 @@ A task is a function of a module and its job is small, so any process that sees 
 it. Of the points of a tile and its halo only those that a stage is asked about are read.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -47,7 +46,9 @@ from dougong.tiles.cloud import (
     TiledCloud,
     load_tiles,
     read_arrays,
+    read_file,
 )
+from dougong.tiles.folder import Folder
 from dougong.typing import Mask, Points, Values
 
 Among = Literal["left", "off_ground"]
@@ -59,7 +60,7 @@ _GROUND = 2
 class Job:
     """A stage on one tile."""
 
-    folder: Path
+    folder: Folder
     tile: Tile
     before: str
     """Key of the stage whose state it starts from; empty: every point is left."""
@@ -68,7 +69,7 @@ class Job:
     asked: int = 0
     """Points of the whole cloud that the stage is asked about."""
     known: Any = None
-    """What the stage knows of the whole cloud, or the path where it is."""
+    """What the stage knows of the whole cloud, or the file where it is."""
 
 
 class Part(NamedTuple):
@@ -80,7 +81,7 @@ class Part(NamedTuple):
     voxel_count: NDArray[np.int32] | None
 
 
-def state_of(folder: Path, tile: Tile, stage: str) -> Arrays:
+def state_of(folder: Folder, tile: Tile, stage: str) -> Arrays:
     """Return the codes of a tile's points and what else is known of them after a stage."""
     if not stage:
         zeros = np.zeros(tile.points, np.uint8)
@@ -103,13 +104,13 @@ def asked_points(job: Job, tile: Tile) -> Points:
 
 
 def _cloud(job: Job) -> TiledCloud:
-    return _read_tiles(job.folder, (job.folder / INDEX).stat().st_mtime_ns)
+    return _read_tiles(job.folder, job.folder.stamp(INDEX))
 
 
 @lru_cache(4)
-def _read_tiles(folder: Path, written_ns: int) -> TiledCloud:
+def _read_tiles(folder: Folder, stamp: Hashable) -> TiledCloud:
     """Return the tiles of a folder, read once: a cloud may have thousands."""
-    del written_ns
+    del stamp
     cloud = load_tiles(folder)
     assert cloud is not None
     return cloud
@@ -156,15 +157,15 @@ def _booked(
 
 
 def judge_low(job: Job) -> tuple[Arrays, Record]:
-    """Low outliers; known: the path of the levels."""
-    is_low = is_low_outlier(asked_points(job, job.tile), load_levels(job.known))
+    """Low outliers; known: the file of the levels."""
+    is_low = is_low_outlier(asked_points(job, job.tile), load_levels(job.folder, job.known))
     return _booked(job, Selection(is_kept=~is_low), Reason.LOW_OUTLIER)
 
 
 def judge_cloth(job: Job) -> tuple[Arrays, Record]:
-    """Ground or not; known: the path of the cloth."""
+    """Ground or not; known: the file of the cloth."""
     assert isinstance(job.params, ClothSimulation)
-    found = classify(asked_points(job, job.tile), load_cloth(job.known), job.params)
+    found = classify(asked_points(job, job.tile), load_cloth(job.folder, job.known), job.params)
     arrays, record = _booked(job, found, Reason.CLOTH)
     places = np.flatnonzero(is_asked(state_of(job.folder, job.tile, job.before), job.among))
     arrays["ground"][places] = found.attributes["ground_class"]
@@ -298,20 +299,19 @@ def _gap(points: Points, tile: Tile) -> Values:
     return gap
 
 
-def load_levels(path: Path) -> Levels:
+def load_levels(folder: Folder, name: str) -> Levels:
     """Return the levels of a cloud, from a file."""
-    levels: Levels = _loaded(path, Levels)
+    levels: Levels = _loaded(folder, name, Levels)
     return levels
 
 
-def load_cloth(path: Path) -> Cloth:
+def load_cloth(folder: Folder, name: str) -> Cloth:
     """Return a cloth, from a file."""
-    cloth: Cloth = _loaded(path, Cloth)
+    cloth: Cloth = _loaded(folder, name, Cloth)
     return cloth
 
 
-def _loaded(path: Path, make: Callable[..., Any]) -> Any:
-    with np.load(path) as stored:
-        # Numbers were written as arrays without axes.
-        held = {name: stored[name] for name in stored.files if name != "record"}
+def _loaded(folder: Folder, name: str, make: Callable[..., Any]) -> Any:
+    held = read_file(folder, name)
+    # Numbers were written as arrays without axes.
     return make(**{name: a if a.ndim else a.item() for name, a in held.items()})

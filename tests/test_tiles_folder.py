@@ -1,0 +1,220 @@
+"""Folders of whole files: on a disk, in memory, and on a real S3 server of this machine."""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dougong.cli import call
+from dougong.errors import InputError, OutputError
+from dougong.tiles import engine as engines
+from dougong.tiles.cloud import read_file, read_record, write_arrays
+from dougong.tiles.folder import LocalFolder, SharedFolder, copies_in, folder_of
+from tile_scans import KILLED, VOXEL, filtered_by, make_little_room, write_scan
+
+fsspec = pytest.importorskip("fsspec")
+moto = pytest.importorskip("moto.server")
+s3fs = pytest.importorskip("s3fs")
+
+
+@pytest.fixture(scope="module")
+def server():
+    """An S3 server."""
+    running = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    running.start()
+    yield "http://{}:{}".format(*running.get_host_and_port())
+    running.stop()
+
+
+@pytest.fixture
+def scan(tmp_path):
+    return write_scan(tmp_path / "scan.laz")
+
+
+@pytest.fixture
+def little_room(monkeypatch):
+    make_little_room(monkeypatch)
+
+
+def as_a_user(monkeypatch, endpoint, **more):
+    """Set the environment as a user of S3 does."""
+    keys = {"AWS_ACCESS_KEY_ID": "user", "AWS_SECRET_ACCESS_KEY": "secret"}
+    for name in [name for name in os.environ if name.startswith("AWS_")]:
+        monkeypatch.delenv(name)
+    settings = {"AWS_ENDPOINT_URL": endpoint, "AWS_DEFAULT_REGION": "us-east-1", **keys, **more}
+    for name, value in settings.items():
+        if value is not None:
+            monkeypatch.setenv(name, value)
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
+@pytest.fixture
+def bucket(server, monkeypatch, request):
+    """The URL of a new bucket, and what lists the keys in it."""
+    as_a_user(monkeypatch, server)
+    name = f"bucket-{abs(hash(request.node.name))}"
+    system = s3fs.S3FileSystem(use_listings_cache=False)
+    system.mkdir(name)
+    yield f"s3://{name}", lambda: sorted(key.partition("/")[2] for key in system.find(name))
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
+@pytest.mark.parametrize("kind", ["disk", "memory", "s3"])
+def test_a_file_is_there_whole_or_not_at_all(kind, tmp_path, bucket):
+    places = {"disk": tmp_path, "memory": "memory://here", "s3": bucket[0]}
+    folder = folder_of(places[kind]) / "tiles-1"
+    assert_whole(folder)
+    with copies_in(tmp_path / "copies"):
+        assert_whole(folder)
+    assert not (tmp_path / "copies").exists()
+
+
+def assert_whole(folder):
+    assert folder.names() == set()
+    with pytest.raises(FileNotFoundError):
+        folder.open("a.npz")
+    assert read_record(folder, "a.npz") is None
+    values = np.arange(30_000)
+    write_arrays(folder, "a.npz", {"values": values, "few": values[:2]}, {"taken": 3})
+    assert read_record(folder, "a.npz") == {"taken": 3}
+    np.testing.assert_array_equal(read_file(folder, "a.npz")["values"], values)
+    assert read_file(folder, "a.npz", "few").keys() == {"few"}
+    stamp = folder.stamp("a.npz")
+    assert folder.stamp("a.npz") == stamp
+
+    def half(file):
+        file.write(b"half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        folder.write("a.npz", half)
+    assert read_record(folder, "a.npz") == {"taken": 3}
+    folder.write("a.npz", lambda file: file.write(b"other"))
+    with folder.open("a.npz") as file:
+        assert file.read() == b"other"
+    assert folder.stamp("a.npz") != stamp
+    assert folder.names() == {"a.npz"}
+    folder.remove()
+    folder.remove()
+    assert folder.names() == set()
+
+
+def test_a_path_is_a_folder_wherever_a_process_stands(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert folder_of("work") == LocalFolder(tmp_path / "work")
+    assert folder_of("s3/work").local == tmp_path / "s3" / "work"
+
+
+def test_storage_is_tried_before_any_work_and_nothing_is_left(bucket):
+    url, keys = bucket
+    assert folder_of(f"{url}/a/b/") == SharedFolder(f"{url}/a/b")
+    assert keys() == []
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [
+        ("s3://", "names no bucket"),
+        ("s3://bucket/w*rk", "holds none of"),
+        ("ftp://host/work", "knows folders and the storage of s3://, gs://, abfs://, got"),
+        ("gs://bucket/work", "needs gcsfs, which is not here: pip install gcsfs"),
+    ],
+)
+def test_a_url_that_cannot_be_is_a_mistake_of_usage(place, said):
+    with pytest.raises(InputError, match=said):
+        folder_of(place)
+
+
+def test_a_missing_package_is_one_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    monkeypatch.delitem(importlib.import_module("fsspec.registry")._registry, "s3", raising=False)
+    with pytest.raises(InputError, match=r"needs s3fs, .* pip install 'dougong\[s3\]'"):
+        folder_of("s3://bucket/work")
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({}, "The specified bucket does not exist"),
+        ({"AWS_ACCESS_KEY_ID": None, "AWS_SECRET_ACCESS_KEY": None}, "credentials"),
+        ({"AWS_ENDPOINT_URL": "nowhere"}, "Invalid endpoint: nowhere"),
+    ],
+)
+def test_storage_that_cannot_be_used_is_one_sentence(
+    settings, said, server, monkeypatch, scan, tmp_path, capsys
+):
+    more = {"AWS_EC2_METADATA_DISABLED": "true", **settings}
+    as_a_user(monkeypatch, more.pop("AWS_ENDPOINT_URL", server), **more)
+    tokens = ["filter", str(scan), str(tmp_path / "out.laz"), "--kind", "lidar", "--quiet"]
+    assert call([*tokens, "--work", "s3://no-such-bucket/work"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: s3://no-such-bucket/work could not be written: ")
+    assert said in error
+    assert error.count("\n") == 1
+    assert "AWS_ENDPOINT_URL" in error
+    with pytest.raises(OutputError):
+        folder_of("s3://no-such-bucket")
+
+
+def test_a_filter_on_shared_tiles_is_the_same_and_goes_on(
+    scan, tmp_path, little_room, bucket, monkeypatch
+):
+    url, keys = bucket
+    whole, _ = filtered_by(scan, tmp_path / "whole.laz", "--kind", "lidar", "--memory", "4GB")
+    options = ("--kind", "lidar", "--memory", "190kB", "--work", f"{url}/site")
+    tiled, _ = filtered_by(scan, tmp_path / "tiled.laz", *options)
+    np.testing.assert_array_equal(tiled.records, whole.records)
+    there = keys()
+    assert len(there) > 20
+    assert all(key.startswith("site/tiles-") and key.endswith((".npz", ".json")) for key in there)
+    assert {path.name.partition(".")[0] for path in tmp_path.iterdir()} == {
+        "scan",
+        "whole",
+        "tiled",
+    }
+
+    def refuse(task):
+        raise AssertionError(f"{task.tile} is done again")
+
+    monkeypatch.setattr(engines, "perform", refuse)
+    again, _ = filtered_by(scan, tmp_path / "again.laz", *options)
+    np.testing.assert_array_equal(again.records, whole.records)
+    assert keys() == there
+
+
+def test_a_run_on_shared_storage_has_the_same_hash(
+    scan, tmp_path, little_room, bucket, monkeypatch, capsys
+):
+    url, keys = bucket
+    monkeypatch.setattr("dougong.app._build_report", lambda *_: None)
+    hashes = []
+    project = tmp_path / "site.toml"
+    project.write_text(
+        '[[cloud]]\nname = "scan"\nkind = "lidar"\nfiles = ["scan.laz"]\n'
+        "[filter.lidar.octree_voxel_grid]\nvoxel_m = 0.1\n"
+    )
+    for name, work in (("disk", tmp_path / "work"), ("shared", url), ("again", url)):
+        tokens = ["run", str(project), "--out", str(tmp_path / name), "--memory", "190kB"]
+        assert call([*tokens, "--work", str(work)]) == 0
+        hashes.append(json.loads((tmp_path / name / "result.json").read_text())["result_hash"])
+    assert len(set(hashes)) == 1
+    assert capsys.readouterr().err.count("not filtered again") == 1
+    on_disk = {path.relative_to(tmp_path / "work") for path in (tmp_path / "work").rglob("*.*")}
+    assert {str(path) for path in on_disk} == set(keys())
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"scan.laz", "site.toml", "work", "disk", "shared", "again"}
+
+
+def test_a_killed_run_goes_on_from_shared_storage(scan, tmp_path, little_room, bucket):
+    whole, _ = filtered_by(scan, tmp_path / "whole.laz", "--kind", "lidar", "--memory", "4GB")
+    tokens = ["filter", str(scan), str(tmp_path / "out.laz"), "--kind", "lidar", "--set", VOXEL]
+    tokens += ["--memory", "190kB", "--work", bucket[0], "--quiet"]
+    for tasks, code in ((7, -9), (1000, 0)):
+        command = [sys.executable, "-c", KILLED, str(tasks), *tokens, "--overwrite"]
+        assert subprocess.run(command, check=False).returncode == code
+    found, _ = filtered_by(scan, tmp_path / "out.laz", "--kind", "lidar", "--overwrite")
+    np.testing.assert_array_equal(found.records, whole.records)
