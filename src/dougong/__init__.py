@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         RegistrationError,
     )
     from dougong.filters.cloth_simulation import ClothSimulation
+    from dougong.filters.clutter import Clutter
     from dougong.filters.curvature_weighted import CurvatureWeighted
     from dougong.filters.low_outliers import LowOutliers
     from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
@@ -48,6 +49,7 @@ _HOME = {
     "register": "app",
     "Register": "registration",
     "ClothSimulation": "filters",
+    "Clutter": "filters",
     "CurvatureWeighted": "filters",
     "LowOutliers": "filters",
     "OctreeVoxelGrid": "filters",
@@ -67,6 +69,7 @@ _NAME_AT_HOME = {"filter": "filter_cloud", "register": "register_clouds"}
 __all__ = [
     "ClothSimulation",
     "Cloud",
+    "Clutter",
     "CurvatureWeighted",
     "DataWarning",
     "DougongError",

@@ -40,10 +40,10 @@ def command(
         The sensor; needed for the recipe.
     only
         One filter by name instead of the recipe: octree_voxel_grid, cloth_simulation,
-        curvature_weighted, statistical, radius, pass_through, low_outliers.
+        curvature_weighted, statistical, radius, pass_through, low_outliers, clutter.
     mark
-        Keep every point; class 2 ground, 7 noise, the reason in dougong_reason, the old class in
-        classification_in.
+        Keep every point; class 2 ground, 7 noise, 64 clutter, the reason in dougong_reason, the
+        old class in classification_in.
     settings
         NAME.FIELD=VALUE, for example curvature_weighted.rule=paper; may be given several times.
     overwrite

@@ -14,6 +14,7 @@ from dougong.filters.selection import NOISE, Reason, Selection
 
 if TYPE_CHECKING:
     from dougong.filters.cloth_simulation import ClothSimulation, cloth_simulation
+    from dougong.filters.clutter import Clutter, clutter
     from dougong.filters.curvature_weighted import CurvatureWeighted, curvature_weighted
     from dougong.filters.low_outliers import LowOutliers, low_outliers
     from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid
@@ -25,6 +26,7 @@ __all__ = [
     "FILTERS",
     "NOISE",
     "ClothSimulation",
+    "Clutter",
     "CurvatureWeighted",
     "FilterSpec",
     "LowOutliers",
@@ -35,6 +37,7 @@ __all__ = [
     "Selection",
     "Statistical",
     "cloth_simulation",
+    "clutter",
     "curvature_weighted",
     "find",
     "low_outliers",

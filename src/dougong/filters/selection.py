@@ -22,6 +22,7 @@ class Reason(IntEnum):
     RADIUS = 5
     PASS_THROUGH = 6
     CLOTH = 7
+    CLUTTER = 8
 
 
 NOISE = frozenset(
@@ -45,9 +46,14 @@ class Selection:
     """(n,) arrays that the filter worked out on the way (curvature, height_above_ground ...)."""
     notes: tuple[str, ...] = ()
     """What the user should know, in words and counted."""
+    found: Mapping[str, int] = field(default_factory=dict)
+    """What was found besides, counted under names (clutter: clusters and points per kind)."""
 
 
 DETAIL, MARGIN = "dougong_detail", "dougong_margin"
+CLUTTER, CLUTTER_MARGIN = "dougong_clutter", "dougong_clutter_margin"
+DETAILS = (DETAIL, MARGIN, CLUTTER, CLUTTER_MARGIN)
+"""What is written of a point besides its reason, by the names of the attributes."""
 MARGIN_MOST = 1e6
 """Margins are written as at most this: a point alone has an infinite one."""
 
@@ -58,6 +64,8 @@ def details_of(selection: Selection) -> dict[str, NDArray[Any]]:
     for given, name, dtype in (
         ("removal_reason", DETAIL, np.uint8),
         ("removal_margin", MARGIN, np.float32),
+        ("clutter_kind", CLUTTER, np.uint8),
+        ("clutter_margin", CLUTTER_MARGIN, np.float32),
     ):
         if given not in selection.attributes:
             continue

@@ -7,10 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong.cloud import Cloud
-from dougong.filters.selection import NOISE, Reason
-from dougong.pipeline.steps import GROUND
+from dougong.filters.selection import CLUTTER, CLUTTER_MARGIN, NOISE, Reason
+from dougong.pipeline.steps import GROUND, Filtered
+from dougong.typing import Mask
 
 GROUND_CLASS, NOISE_CLASS = 2, 7
+CLUTTER_CLASS = 64
+"""The first class that LAS 1.4 leaves to its users. Point formats 0 to 5 hold classes up to 31:
+there the class stays, and ``dougong_clutter`` alone says what was offered."""
 
 
 def marked(
@@ -21,8 +25,8 @@ def marked(
 ) -> Cloud:
     """Return all points of `cloud` with classes and reasons.
 
-    Ground becomes class 2 and noise class 7; decimated and cropped points keep theirs. The old
-    class is saved as ``classification_in``, the reason as ``dougong_reason``.
+    Ground becomes class 2, noise class 7 and clutter class 64; decimated and cropped points keep
+    theirs. The old class is saved as ``classification_in``, the reason as ``dougong_reason``.
 
     Parameters
     ----------
@@ -36,11 +40,38 @@ def marked(
     """
     is_noise = np.isin(codes, [int(reason) for reason in NOISE])
     is_ground = (ground_class == GROUND) & (codes == Reason.KEPT)
-    result = with_classes(cloud, [(is_ground, GROUND_CLASS), (is_noise, NOISE_CLASS)])
+    is_clutter = clutter_of(details or {}, len(cloud)) & np.isin(
+        codes, [int(Reason.KEPT), int(Reason.CLUTTER)]
+    )
+    result = with_classes(
+        cloud,
+        [(is_ground, GROUND_CLASS), (is_noise, NOISE_CLASS), (is_clutter, CLUTTER_CLASS)],
+    )
     result = result.with_attribute("dougong_reason", codes.astype(np.uint8))
     for name, values in (details or {}).items():
         result = result.with_attribute(name, values)
     return result
+
+
+def with_clutter(filtered: Filtered) -> Cloud:
+    """Return the kept points with what they were taken for, clutter in a class of its own."""
+    is_kept = filtered.codes == Reason.KEPT
+    kind = filtered.details[CLUTTER][is_kept]
+    result = with_classes(filtered.cloud, [(kind > 0, CLUTTER_CLASS)])
+    result = result.with_attribute(CLUTTER, kind)
+    return result.with_attribute(CLUTTER_MARGIN, filtered.details[CLUTTER_MARGIN][is_kept])
+
+
+def clutter_of(details: Mapping[str, NDArray[Any]], points: int) -> Mask:
+    """Return which of so many points were offered as clutter."""
+    offered: Mask = details.get(CLUTTER, np.zeros(points, np.uint8)) > 0
+    return offered
+
+
+def _holds(cloud: Cloud, value: int) -> bool:
+    """Say whether the records of a cloud can hold a class."""
+    bit = cloud.bits.get("classification")
+    return bit is None or value <= bit.mask >> bit.shift
 
 
 def with_classes(cloud: Cloud, classes: list[tuple[NDArray[np.bool_], int]]) -> Cloud:
@@ -49,7 +80,8 @@ def with_classes(cloud: Cloud, classes: list[tuple[NDArray[np.bool_], int]]) -> 
     old = np.zeros(len(cloud), np.uint8) if stored is None else stored.astype(np.uint8)
     new = old.copy()
     for chosen, value in classes:
-        new[chosen] = value
+        if _holds(cloud, value):
+            new[chosen] = value
     if stored is not None:
         cloud = cloud.with_attribute("classification_in", old)
         new = new.astype(stored.dtype)

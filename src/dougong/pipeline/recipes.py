@@ -1,7 +1,8 @@
 """The two recipes: which filters a sensor's cloud passes, in which order (METHOD.md section 1).
 
-lidar: octree voxel grid -> low outliers -> cloth -> CWASF on what is not ground -> pass-through.
-photogrammetry: statistical -> low outliers -> cloth -> pass-through.
+lidar: octree voxel grid -> low outliers -> cloth -> CWASF on what is not ground -> (clutter) ->
+pass-through. photogrammetry: statistical -> low outliers -> cloth -> (clutter) -> pass-through.
+Clutter is looked for where its ``action`` is not off.
 The ground is a branch and is never thrown away: only noise below it and a crop take ground points.
 """
 
@@ -12,6 +13,7 @@ from pydantic import model_validator
 from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.filters.cloth_simulation import ClothSimulation
+from dougong.filters.clutter import Clutter
 from dougong.filters.curvature_weighted import CurvatureWeighted
 from dougong.filters.low_outliers import LowOutliers
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
@@ -48,6 +50,7 @@ class LidarRecipe(SensorRecipe):
     cloth_simulation: ClothSimulation = ClothSimulation(class_threshold_m=0.09)
     """H = 0.09 m is the paper's; it exceeds 3 sigma of a scanner (about 2 cm) plus the slope."""
     curvature_weighted: CurvatureWeighted = CurvatureWeighted()
+    clutter: Clutter = Clutter(action="off")
     pass_through: PassThrough = PassThrough()
 
 
@@ -58,6 +61,7 @@ class PhotogrammetryRecipe(SensorRecipe):
     low_outliers: LowOutliers = LowOutliers()
     cloth_simulation: ClothSimulation = ClothSimulation(class_threshold_m=0.15)
     """H = 0.15 m: 3 sigma of 1-3 cm noise plus the slope under half a cloth cell."""
+    clutter: Clutter = Clutter(action="off")
     pass_through: PassThrough = PassThrough()
 
 
@@ -111,6 +115,7 @@ def steps_of(kind: Kind, recipe: Recipe) -> tuple[Step, ...]:
             Step("statistical", flight.statistical),
             Step("low_outliers", flight.low_outliers),
             Step("cloth_simulation", flight.cloth_simulation),
+            *_clutter(flight.clutter),
             Step("pass_through", flight.pass_through),
         )
     scan = recipe.lidar
@@ -119,5 +124,10 @@ def steps_of(kind: Kind, recipe: Recipe) -> tuple[Step, ...]:
         Step("low_outliers", scan.low_outliers),
         Step("cloth_simulation", scan.cloth_simulation),
         Step("curvature_weighted", scan.curvature_weighted, "off_ground"),
+        *_clutter(scan.clutter),
         Step("pass_through", scan.pass_through),
     )
+
+
+def _clutter(params: Clutter) -> tuple[Step, ...]:
+    return () if params.action == "off" else (Step("clutter", params, "off_ground"),)

@@ -7,6 +7,7 @@ from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.filters import FILTERS
 from dougong.filters.cloth_simulation import ClothSimulation
+from dougong.filters.clutter import Clutter
 from dougong.filters.pass_through import PassThrough
 from dougong.formats import require_metric
 from dougong.params import Parameters
@@ -65,6 +66,8 @@ def filter_single(
 
 def single_steps(name: str, params: Parameters) -> tuple[Step, ...]:
     """Return one filter as steps, with what it needs before it."""
+    if isinstance(params, Clutter):
+        return Step("cloth_simulation", ClothSimulation()), Step(name, params, "off_ground")
     step = Step(name, params)
     if isinstance(params, PassThrough) and params.needs_height:
         # Heights are counted from the ground, which only the cloth knows.

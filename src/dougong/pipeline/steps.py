@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dougong.cloud import Cloud, chosen_rows
 from dougong.errors import InputError
 from dougong.filters.cloth_simulation import ClothSimulation, cloth_simulation
+from dougong.filters.clutter import Clutter, clutter
 from dougong.filters.curvature_weighted import CurvatureWeighted, curvature_weighted
 from dougong.filters.low_outliers import LowOutliers, low_outliers
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid
@@ -40,6 +41,8 @@ class StageCount:
     points_in: int
     points_out: int
     seconds: float
+    found: Mapping[str, int] = field(default_factory=dict)
+    """What it found besides, counted (`Selection.found`)."""
 
     @property
     def reduction(self) -> float:
@@ -123,6 +126,7 @@ class Bench:
                 points_in=len(left),
                 points_out=len(left) - taken,
                 seconds=time.perf_counter() - start,
+                found=dict(selection.found),
             )
         )
         said = [*selection.notes, *doubts(reason, taken, len(asked))]
@@ -242,6 +246,20 @@ def run_radius(bench: Bench, params: Radius) -> None:
     bench.apply("radius", Reason.RADIUS, lambda index: radius(bench.cloud.xyz[index], params))
 
 
+def run_clutter(bench: Bench, params: Clutter, among: Index | None = None) -> None:
+    """Offer people, vehicles, poles and wires, or take them out."""
+    heights = bench.height_above_ground
+    if heights is None:
+        msg = "clutter needs heights above the ground; run cloth_simulation before it."
+        raise InputError(msg)
+    bench.apply(
+        "clutter",
+        Reason.CLUTTER,
+        lambda index: clutter(bench.cloud.xyz[index], params, height_above_ground=heights[index]),
+        among,
+    )
+
+
 def run_pass_through(bench: Bench, params: PassThrough) -> None:
     """Crop by axis range, box, polygon (all in the file's coordinates, metres) and height."""
     heights = bench.height_above_ground
@@ -264,6 +282,7 @@ _RUN: dict[str, Callable[[Bench, Any], None]] = {
     "curvature_weighted": run_curvature_weighted,
     "statistical": run_statistical,
     "radius": run_radius,
+    "clutter": run_clutter,
     "pass_through": run_pass_through,
 }
 
@@ -273,6 +292,10 @@ def run_step(bench: Bench, step: Step) -> None:
     if step.among == "left":
         _RUN[step.name](bench, step.params)
         return
-    assert isinstance(step.params, CurvatureWeighted)
     left = bench.left()
-    run_curvature_weighted(bench, step.params, left[bench.ground_class[left] != GROUND])
+    off_ground = left[bench.ground_class[left] != GROUND]
+    if isinstance(step.params, Clutter):
+        run_clutter(bench, step.params, off_ground)
+        return
+    assert isinstance(step.params, CurvatureWeighted)
+    run_curvature_weighted(bench, step.params, off_ground)

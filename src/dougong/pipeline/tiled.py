@@ -21,7 +21,7 @@ from dougong.errors import InputError
 from dougong.filters import FILTERS
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
 from dougong.filters.pass_through import PassThrough
-from dougong.filters.selection import DETAIL, MARGIN, Reason
+from dougong.filters.selection import DETAILS, Reason
 from dougong.formats import describe, iterate, require_metric
 from dougong.pipeline.memory import Room
 from dougong.pipeline.progress import Progress
@@ -182,6 +182,7 @@ def _run_steps(
                 points_in=done.left,
                 points_out=done.left - done.taken,
                 seconds=done.seconds,
+                found=done.found,
             )
         )
     return notes
@@ -235,7 +236,7 @@ def _books(
         row = read_arrays(folder, tile, POINTS, "row")["row"]
         state = state_of(folder, tile, bench.state)
         codes[row], ground[row] = state["code"], state["ground"]
-        for name in (DETAIL, MARGIN):
+        for name in DETAILS:
             if name in state:
                 details.setdefault(name, np.zeros(points, state[name].dtype))[row] = state[name]
     return Books(

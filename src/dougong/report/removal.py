@@ -21,6 +21,7 @@ WORDS = {
     Reason.STATISTICAL: "noise, far from its neighbours",
     Reason.RADIUS: "noise, too few neighbours",
     Reason.PASS_THROUGH: "cropped",
+    Reason.CLUTTER: "clutter: looks like a person, vehicle, pole or wire",
     Reason.CLOTH: "on the side of the ground that was not asked for",
 }
 _CELL_M = 0.5

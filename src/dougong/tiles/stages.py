@@ -7,7 +7,7 @@ goes on where it was and a changed parameter reruns only what depends on it.
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 import dougong
 from dougong.filters import protective
 from dougong.filters.cloth_simulation import ClothSimulation, cloth_notes, guarded_cloth
+from dougong.filters.clutter import Clutter, clutter_notes
 from dougong.filters.concentration import note_of, tally
 from dougong.filters.curvature_weighted import CurvatureWeighted
 from dougong.filters.low_outliers import LowOutliers, find_levels, low_notes
@@ -55,6 +56,8 @@ class StageDone:
     taken: int
     notes: tuple[str, ...]
     seconds: float
+    found: Mapping[str, int] = field(default_factory=dict)
+    """What it found besides, counted (`Selection.found`)."""
 
 
 @dataclass(slots=True)
@@ -82,9 +85,15 @@ class TileBench:
         stage = _Stage(self.cloud, self.engine, self.state, params, among, asked)
         records, notes, self.state = _RUN[name](stage)
         totals = {key: sum(r[key] for r in records) for key in ("left", "asked", "taken")}
-        found = StageDone(name=name, notes=notes, seconds=time.perf_counter() - start, **totals)
-        self.done.append(found)
-        return found
+        done = StageDone(
+            name=name,
+            notes=notes,
+            seconds=time.perf_counter() - start,
+            found=_found(records),
+            **totals,
+        )
+        self.done.append(done)
+        return done
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +165,15 @@ def _sum(records: list[Record], name: str) -> int:
     return sum(record[name] for record in records)
 
 
+def _found(records: list[Record]) -> dict[str, int]:
+    """Return the sums of what the tiles found besides."""
+    total: dict[str, int] = {}
+    for record in records:
+        for name, count in record.get("found", {}).items():
+            total[name] = total.get(name, 0) + count
+    return total
+
+
 def _low_outliers(stage: _Stage) -> Outcome:
     assert isinstance(stage.params, LowOutliers)
     params = stage.params
@@ -190,6 +208,12 @@ def _radius(stage: _Stage) -> Outcome:
     assert isinstance(stage.params, Radius)
     records, key = stage.map("radius", work.judge_radius)
     return records, (), key
+
+
+def _clutter(stage: _Stage) -> Outcome:
+    assert isinstance(stage.params, Clutter)
+    records, key = stage.map("clutter", work.judge_clutter)
+    return records, clutter_notes(_found(records)), key
 
 
 def _statistical(stage: _Stage) -> Outcome:
@@ -271,5 +295,6 @@ _RUN: dict[str, Callable[[_Stage], Outcome]] = {
     "curvature_weighted": _curvature_weighted,
     "statistical": _statistical,
     "radius": _radius,
+    "clutter": _clutter,
     "pass_through": _pass_through,
 }

@@ -13,7 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong._boxes import are_within
+from dougong.errors import InputError
 from dougong.filters.cloth_simulation import UNKNOWN, Cloth, ClothSimulation, classify
+from dougong.filters.clutter import Clutter, clutter
+from dougong.filters.clutter import halo_m as clutter_halo_m
 from dougong.filters.curvature_weighted import (
     CurvatureWeighted,
     curvature_weighted,
@@ -27,7 +30,7 @@ from dougong.filters.pass_through import PassThrough, pass_through
 from dougong.filters.protective import Whole
 from dougong.filters.protective import halo_m as protective_halo_m
 from dougong.filters.radius import Radius, radius
-from dougong.filters.selection import Reason, Selection, details_of
+from dougong.filters.selection import DETAILS, Reason, Selection, details_of
 from dougong.filters.statistical import (
     Statistical,
     mean_and_largest,
@@ -52,7 +55,7 @@ from dougong.tiles.folder import Folder
 from dougong.typing import Mask, Points, Values
 
 Among = Literal["left", "off_ground"]
-_STATE = ("code", "ground", "height", "dougong_detail", "dougong_margin")
+_STATE = ("code", "ground", "height", *DETAILS)
 _GROUND = 2
 
 
@@ -79,6 +82,8 @@ class Part(NamedTuple):
     own: int
     """The first so many are the tile's own."""
     voxel_count: NDArray[np.int32] | None
+    height: Values | None
+    """Above the ground, where the cloth has been."""
 
 
 def state_of(folder: Folder, tile: Tile, stage: str) -> Arrays:
@@ -117,17 +122,24 @@ def _read_tiles(folder: Folder, stamp: Hashable) -> TiledCloud:
 
 
 def _with_halo(job: Job, halo_m: float) -> Part:
-    points, counts = [], []
+    points, counts, heights = [], [], []
     for tile in (job.tile, *_cloud(job).near(job.tile, halo_m)):
         held = read_arrays(job.folder, tile, POINTS)
-        chosen = is_asked(state_of(job.folder, tile, job.before), job.among)
+        state = state_of(job.folder, tile, job.before)
+        chosen = is_asked(state, job.among)
         if tile != job.tile:
             chosen &= _in_box(held["xyz"], job.tile, halo_m)
         points.append(held["xyz"][chosen])
         if "voxel_count" in held:
             counts.append(held["voxel_count"][chosen])
-    together = np.ascontiguousarray(np.concatenate(points))
-    return Part(together, len(points[0]), np.concatenate(counts) if counts else None)
+        if "height" in state:
+            heights.append(state["height"][chosen])
+    return Part(
+        points=np.ascontiguousarray(np.concatenate(points)),
+        own=len(points[0]),
+        voxel_count=np.concatenate(counts) if counts else None,
+        height=np.concatenate(heights) if heights else None,
+    )
 
 
 def _in_box(xyz: Points, tile: Tile, wider_m: float) -> Mask:
@@ -180,6 +192,18 @@ def judge_radius(job: Job) -> tuple[Arrays, Record]:
     assert isinstance(job.params, Radius)
     part = _with_halo(job, job.params.radius_m)
     return _booked(job, _own(radius(part.points, job.params), part.own), Reason.RADIUS)
+
+
+def judge_clutter(job: Job) -> tuple[Arrays, Record]:
+    """Offer what stands about, or take it out."""
+    assert isinstance(job.params, Clutter)
+    part = _with_halo(job, clutter_halo_m(job.params))
+    if part.height is None:
+        msg = "clutter needs heights above the ground; run cloth_simulation before it."
+        raise InputError(msg)
+    found = clutter(part.points, job.params, height_above_ground=part.height, own=part.own)
+    arrays, record = _booked(job, _own(found, part.own), Reason.CLUTTER)
+    return arrays, {**record, "found": dict(found.found)}
 
 
 def judge_statistical(job: Job) -> tuple[Arrays, Record]:

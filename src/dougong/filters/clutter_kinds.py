@@ -1,0 +1,110 @@
+"""The rules by which a cluster counts as a person, a vehicle or a pole.
+
+A rule is a list of measures, each with its limits; the margin is how far the tightest lies inside,
+as a share of the limit. Sizes are parameters; the proportions that tell heritage apart are here.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+from dougong.filters.clutter_shapes import Shape
+
+if TYPE_CHECKING:
+    from dougong.filters.clutter import Clutter
+
+LOWEST_M = 0.6
+"""What stands on the ground begins below this: its feet may be hidden in grass."""
+FILLED = 0.7
+"""At least this share of its layers holds points: nothing hovers over a gap."""
+HEAD_M = 0.15
+"""A head is no wider to either side (root mean square)."""
+SHOULDERS = 1.4
+"""The widest layer of a person is at least so many times its head: steles and posts have none."""
+PLINTH = 1.2
+"""The foot of a person is at most so many times its upper body; a statue's plinth is more."""
+WAIST = 0.87
+"""Half of a person's layers are at most this share of its widest: posts are as wide all the way."""
+CABIN_M = 0.4
+"""The roof of a vehicle extends so far to either side of its middle (root mean square)."""
+OBLONG = 1.3
+"""A vehicle is at least so many times as long as wide."""
+SLENDER = 10.0
+"""A pole is at least so many times as tall as wide."""
+POLE_FOOT = 1.5
+"""The foot of a pole is at most so many times `pole_radius_m` wide to either side."""
+
+
+class ClutterKind(IntEnum):
+    """What a point was taken for: attribute ``clutter_kind``, written as ``dougong_clutter``."""
+
+    NONE = 0
+    PERSON = 1
+    VEHICLE = 2
+    POLE = 3
+    WIRE = 4
+
+
+def at_least(value: float, limit: float) -> float:
+    """Return how far `value` lies above `limit`, as a share of it; below 0: it does not."""
+    return value / limit - 1.0 if limit > 0.0 else 0.0
+
+
+def at_most(value: float, limit: float) -> float:
+    """Return how far `value` lies below `limit`, as a share of it; below 0: it does not."""
+    return 1.0 - value / limit if limit > 0.0 else -1.0
+
+
+def between(value: float, limits: tuple[float, float]) -> float:
+    """Return how far `value` lies within `limits`, as a share of the nearer; below 0: outside."""
+    return min(at_least(value, limits[0]), at_most(value, limits[1]))
+
+
+def kind_of(shape: Shape, p: Clutter) -> tuple[ClutterKind, float]:
+    """Return what a cluster looks like most, and its margin; NONE and 0 where nothing fits.
+
+    Whether a pole stands clear of large things is for the caller to see.
+    """
+    if at_most(shape.low_m, LOWEST_M) < 0 or shape.filled < FILLED:
+        return ClutterKind.NONE, 0.0
+    margins = {
+        ClutterKind.PERSON: _person(shape, p),
+        ClutterKind.VEHICLE: _vehicle(shape, p),
+        ClutterKind.POLE: _pole(shape, p),
+    }
+    offered = {kind: m for kind, m in margins.items() if kind.name.lower() in p.kinds}
+    best = max(offered, key=lambda kind: offered[kind], default=ClutterKind.NONE)
+    if best == ClutterKind.NONE or offered[best] < max(p.min_margin, 0.0):
+        return ClutterKind.NONE, 0.0
+    return best, offered[best]
+
+
+def _person(s: Shape, p: Clutter) -> float:
+    return min(
+        between(s.top_m, p.person_height_m),
+        between(s.length_m, p.person_length_m),
+        at_most(s.head_m, HEAD_M),
+        at_least(s.body_m, SHOULDERS * s.head_m),
+        at_most(s.foot_m, PLINTH * s.body_m),
+        at_most(s.median_m, WAIST * s.body_m),
+    )
+
+
+def _vehicle(s: Shape, p: Clutter) -> float:
+    return min(
+        between(s.top_m, p.vehicle_height_m),
+        between(s.length_m, p.vehicle_length_m),
+        between(s.width_m, p.vehicle_width_m),
+        at_least(s.head_m, CABIN_M),
+        at_least(s.length_m, OBLONG * s.width_m),
+    )
+
+
+def _pole(s: Shape, p: Clutter) -> float:
+    return min(
+        between(s.top_m, p.pole_height_m),
+        at_most(s.median_m, p.pole_radius_m),
+        at_most(s.foot_m, POLE_FOOT * p.pole_radius_m),
+        at_least(s.top_m, 2.0 * SLENDER * s.median_m),
+    )

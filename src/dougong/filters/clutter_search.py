@@ -1,0 +1,154 @@
+"""The search behind `clutter`: wires first, then clusters of the rest, described one by one.
+
+Kernels are imported when called.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dougong.filters import wires
+from dougong.filters.clusters import (
+    Clusters,
+    clusters_of,
+    distance_to,
+    eighth_nearest,
+    members,
+    spacing_of,
+)
+from dougong.filters.clutter_kinds import ClutterKind, kind_of
+from dougong.filters.clutter_shapes import shape_of
+from dougong.filters.neighbourhood import Neighbourhood, build_index, nearest
+from dougong.typing import Index, Points, Values
+
+if TYPE_CHECKING:
+    from dougong.filters.clutter import Clutter
+
+STRUCTURE_M = 3.0
+"""A pole must stand clear of clusters longer than this."""
+GAP_SPACINGS = 5.0
+"""Points of a cluster are at most so many spacings from one another."""
+
+
+class Found(NamedTuple):
+    """What was found among n points, in the caller's order."""
+
+    kind: NDArray[np.uint8]
+    margin: Values
+    counts: dict[str, int]
+    """Own clusters and points by kind: ``person_clusters``, ``person_points`` ..."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Site:
+    """The points that clusters are made of; everything in the order of the index."""
+
+    index: Neighbourhood
+    place: Index
+    """(m,) place of each point in the caller's array."""
+    clusters: Clusters
+    low: dict[int, Index]
+    """By the root of a cluster: places in the caller's array of the low points beside it."""
+
+
+def halo_m(params: Clutter) -> float:
+    """Return how far the search reaches: a cluster, what it stands clear of, and wires between."""
+    gaps = 3.0 * params.gap_most_m
+    return params.largest_m + params.pole_clear_m + STRUCTURE_M + gaps + wires.halo_m()
+
+
+def nothing(points: int) -> Found:
+    """Return that nothing was found among so many points."""
+    return Found(np.zeros(points, np.uint8), np.zeros(points), {})
+
+
+def search(xyz: Points, height: Values, p: Clutter, own: int) -> Found:
+    """Look for clutter among points (n, 3) of known `height` (n,); the first `own` count."""
+    kind, margin, counts = nothing(len(xyz))
+    is_low = height < p.foot_m
+    up = np.flatnonzero(~is_low)
+    index = build_index(xyz[up])
+    eighth = eighth_nearest(index, p.gap_most_m)
+    run = wires.runs_of_wires(index, height[up][index.order], eighth, p.wire_height_m)
+    is_wire = run >= p.wire_length_m
+    if "wire" in p.kinds:
+        along = (run[is_wire] - p.wire_length_m) / p.wire_length_m
+        chosen = up[index.order[is_wire]][along >= p.min_margin]
+        kind[chosen], margin[chosen] = ClutterKind.WIRE, along[along >= p.min_margin]
+    site = _site(xyz, up[index.order[~is_wire]], eighth[~is_wire], np.flatnonzero(is_low), p)
+    for places, found, share in _offered(site, xyz, height, p, own):
+        kind[places], margin[places] = found, share
+        # A cluster that several parts of a cloud see belongs to one: that of its first point.
+        _count(counts, f"{found.name.lower()}_clusters", int(places[0] < own))
+    for found in ClutterKind:
+        if found != ClutterKind.NONE:
+            points = int(np.count_nonzero(kind[:own] == found))
+            _count(counts, f"{found.name.lower()}_points", points)
+    return Found(kind, margin, counts)
+
+
+def _count(counts: dict[str, int], name: str, more: int) -> None:
+    if more:
+        counts[name] = counts.get(name, 0) + more
+
+
+def _site(xyz: Points, place: Index, eighth: Values, low: Index, p: Clutter) -> _Site:
+    """Cluster the points at `place`, and give each cluster the low points beside it."""
+    index = build_index(xyz[place])
+    gap = np.clip(GAP_SPACINGS * spacing_of(eighth[index.order]), p.gap_least_m, p.gap_most_m)
+    clusters = clusters_of(index, gap, p.gap_least_m)
+    beside: dict[int, Index] = {}
+    if len(low) and len(place):
+        at, _ = nearest(index, xyz[low], p.gap_least_m)
+        low, at = low[at >= 0], at[at >= 0]
+        sorted_place = np.empty(len(place), np.int64)
+        sorted_place[index.order] = np.arange(len(place))
+        root = clusters.root[sorted_place[at]]
+        order = np.argsort(root, kind="stable")
+        roots, starts = np.unique(root[order], return_index=True)
+        beside = dict(zip(roots.tolist(), np.split(low[order], starts[1:]), strict=True))
+    return _Site(index, place[index.order], clusters, beside)
+
+
+def _offered(
+    site: _Site, xyz: Points, height: Values, p: Clutter, own: int
+) -> list[tuple[Index, ClutterKind, float]]:
+    """Return the clusters with own points that are clutter: places, kind and margin of each."""
+    clusters = site.clusters
+    is_small = (clusters.held >= p.min_points) & (clusters.longest_m <= p.largest_m)
+    has_own = np.zeros(len(clusters.root), bool)
+    has_own[clusters.root[site.place < own]] = True
+    roots = np.flatnonzero(is_small & has_own)
+    offered: list[tuple[Index, ClutterKind, float]] = []
+    for root, members_of in zip(roots, members(clusters, roots), strict=True):
+        low = site.low.get(int(root), np.empty(0, np.int64))
+        places = _by_content(xyz, np.concatenate([site.place[members_of], low]))
+        if np.isnan(height[places]).any():
+            continue
+        kind, margin = kind_of(shape_of(xyz[places], height[places]), p)
+        if kind == ClutterKind.POLE and not _stands_clear(site, members_of, p.pole_clear_m):
+            continue
+        if kind != ClutterKind.NONE:
+            offered.append((places, kind, margin))
+    return offered
+
+
+def _by_content(xyz: Points, places: Index) -> Index:
+    """Return `places` sorted by x, y, z: the same points wherever they come from."""
+    points = xyz[places]
+    ordered: Index = places[np.lexsort((points[:, 2], points[:, 1], points[:, 0]))]
+    return ordered
+
+
+def _stands_clear(site: _Site, members_of: Index, clear_m: float) -> bool:
+    """Say whether no other cluster longer than `STRUCTURE_M` comes within `clear_m` of one."""
+    if clear_m == 0.0:
+        return True
+    own = site.clusters.root[members_of[0]]
+    is_large = site.clusters.longest_m[site.clusters.root] > STRUCTURE_M
+    chosen = is_large & (site.clusters.root != own)
+    return bool(distance_to(site.index, chosen, members_of, clear_m).min() >= clear_m)
