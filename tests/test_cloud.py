@@ -1,5 +1,7 @@
 """Clouds: selecting, packed attributes, moving between frames."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -124,3 +126,10 @@ def test_rebased_points_are_in_the_same_place():
 def test_a_mirror_is_refused():
     with pytest.raises(InputError, match="mirrors"):
         Cloud.from_points(np.zeros((1, 3))).moved(np.diag([1, 1, -1, 1.0]))
+
+
+def test_a_cloud_goes_to_another_process_whole():
+    cloud = Cloud.from_points(np.arange(12.0).reshape(4, 3) + [5e5, 4e6, 0.0])
+    again = pickle.loads(pickle.dumps(cloud))
+    np.testing.assert_array_equal(again.xyz, cloud.xyz)
+    np.testing.assert_array_equal(again.frame.to_file(again.xyz), cloud.frame.to_file(cloud.xyz))

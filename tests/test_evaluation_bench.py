@@ -1,6 +1,8 @@
 """`dougong bench`: what it measures, and that the same work is asked of everyone."""
 
+import importlib.util
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,3 +62,12 @@ def test_scenes_are_the_same_for_a_seed():
     for make in SCENES.values():
         one, two = make(COUNT, 3), make(COUNT, 3)
         assert all(np.array_equal(one[key], two[key]) for key in one)
+
+
+def test_the_readme_shows_what_was_measured():
+    root = Path(__file__).parent.parent
+    spec = importlib.util.spec_from_file_location("keep_bench", root / "docs" / "keep_bench.py")
+    keep_bench = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(keep_bench)
+    section = (root / "README.md").read_text(encoding="utf-8").split(keep_bench.BEGIN)[1]
+    assert section.split(keep_bench.END)[0].strip() == keep_bench.readme_table()

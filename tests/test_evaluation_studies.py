@@ -1,12 +1,15 @@
 """The studies of the paper's tables and figures: that they measure what they say."""
 
 import json
+import os
+from concurrent.futures.process import BrokenProcessPool
 
 import numpy as np
 import pytest
 
 from dougong.cli import call
 from dougong.evaluation import building_runs, coarse_trials, registration_peers
+from dougong.evaluation.apart import apart
 from dougong.evaluation.metrics import pose_errors
 from dougong.evaluation.scenes import make_scene
 from dougong.evaluation.studies import Setting, buildings, coarse, filtering, growth, peers, storage
@@ -219,3 +222,9 @@ def test_a_matrix_is_read_from_text():
     np.testing.assert_array_equal(registration_peers._matrix(text), np.arange(16.0).reshape(4, 4))
     with pytest.raises(registration_peers.PeerFailedError, match="no matrix"):
         registration_peers._matrix("1 2 3")
+
+
+def test_a_measurement_apart_has_a_process_of_its_own():
+    assert apart(os.getpid) != os.getpid()
+    with pytest.raises(BrokenProcessPool):
+        apart(os._exit, 3)

@@ -2,7 +2,8 @@
 
 ``{parameters} MODULE:MODEL TABLE`` lists the fields of a parameter set and of those within it;
 ``{commands}`` every command and its options; ``{reasons}`` the reason codes of removed points;
-``{evidence} STUDY`` the table of a study that was run, or how to run it.
+``{evidence} STUDY`` the table of a study that was run, or how to run it; ``{bench}`` that of the
+speed measurements.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
+
+from dougong.evaluation.bench.table import as_markdown, as_markdown_all
 
 EVIDENCE = Path(__file__).parent.parent / "evidence"
 MOST_ROWS = 60
@@ -227,6 +230,19 @@ class Evidence(Written):
         yield from (note, "") if note else ()
 
 
+class Bench(Written):
+    """Everyone's seconds and memory as they were measured: ``{bench}``."""
+
+    def markdown(self) -> Iterator[str]:
+        """Yield who measured what where, and a row per contender."""
+        path = EVIDENCE / "bench.json"
+        self.env.note_dependency(str(path))
+        document = json.loads(path.read_text(encoding="utf-8"))
+        yield from (*as_markdown(document).splitlines(), "")
+        yield from ("Everyone who was asked, and what they answered:", "")
+        yield from (*as_markdown_all(document).splitlines(), "")
+
+
 def _shown_rows(rows: Sequence[dict[str, Any]]) -> tuple[Sequence[dict[str, Any]], str]:
     """Return the rows that fit on a page, and what was left out: the summaries go first."""
     if len(rows) <= MOST_ROWS:
@@ -271,4 +287,5 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("commands", Commands)
     app.add_directive("reasons", Reasons)
     app.add_directive("evidence", Evidence)
+    app.add_directive("bench", Bench)
     return {"parallel_read_safe": True}

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -151,7 +150,7 @@ class Cloud:
     """(n,) the input's own records."""
     frame: Frame
     name: str = "cloud"
-    bits: Mapping[str, BitField] = field(default_factory=lambda: MappingProxyType({}))
+    bits: Mapping[str, BitField] = field(default_factory=dict)
     """Attributes packed into bits of a record field (LAS flags)."""
     header: Any = None
     """What the format that read the cloud needs to write it again; opaque here."""

@@ -26,14 +26,11 @@ class Common:
     threads: Annotated[int | None, Parameter(group=GLOBAL)] = None
     """Threads to use; default: all this process may use."""
     memory: Annotated[str | None, Parameter(group=GLOBAL)] = None
-    """Memory to stay under, for example 4GB: larger scans are decimated on tiles, what still does
-    not fit is refused."""
+    """Memory to stay under, for example 4GB: larger clouds are worked on in tiles on disk."""
     engine: Annotated[str, Parameter(group=GLOBAL)] = "local"
-    """Who works on the tiles of clouds larger than memory: local, dask (processes of this machine)
-    or dask://HOST:PORT."""
+    """Who works on tiles: local, dask (processes of this machine) or dask://HOST:PORT."""
     work: Annotated[str | None, Parameter(group=GLOBAL)] = None
-    """Folder for finished steps and tiles, so that a cancelled run goes on, or s3://BUCKET/PREFIX;
-    default: beside the output."""
+    """Where finished steps stay: a folder or s3://BUCKET/PREFIX; default: beside the output."""
     seed: Annotated[int, Parameter(group=GLOBAL)] = 0
     """Seed of everything random."""
     debug: Annotated[bool, Parameter(group=GLOBAL, negative="", show_default=False)] = False
