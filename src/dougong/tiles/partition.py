@@ -53,8 +53,7 @@ def partition(
 
     Notes
     -----
-    Memory: about 150 bytes per point of a tile. Disk: twice the records and 32 bytes per point,
-    less what compression saves.
+    Memory: about 150 bytes per point of a tile. Disk: twice the records and 32 bytes per point.
     """
     root = root_cube_of(spool.blocks, spool.points, params or OctreeVoxelGrid())
     sample, far = _sample_and_far(spool)

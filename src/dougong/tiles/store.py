@@ -1,22 +1,22 @@
 """Tiles on disk: rows of points in Arrow files that grow by appending.
 
 A file is a chain of Arrow streams, one per append, so any number of tiles can grow at once without
-being open, and a file is read back in the pieces it was written in.
+being open, and a file is read back in the pieces it was written in. Nothing is compressed: that
+costs twice what all else here does, for rows that are read once or twice and deleted.
 """
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from dougong.cloud import Records, chosen_rows
 from dougong.errors import OutputError
 from dougong.typing import Index, Points
-
-_OPTIONS = pa.ipc.IpcWriteOptions(compression="lz4")
 
 
 class Rows(NamedTuple):
@@ -53,16 +53,14 @@ class RowFile:
         with (
             _told(self.path),
             self.path.open("ab") as file,
-            pa.ipc.new_stream(file, batch.schema, options=_OPTIONS) as writer,
+            pa.ipc.new_stream(file, batch.schema) as writer,
         ):
             writer.write_batch(batch)
 
     def pieces(self) -> Iterator[Rows]:
         """Yield the rows in the pieces they were appended in."""
-        with self.path.open("rb") as file:
-            size = file.seek(0, 2)
-            file.seek(0)
-            while file.tell() < size:
+        with pa.OSFile(str(self.path), "rb") as file:
+            while file.tell() < file.size():
                 yield from _read_stream(file, self.layout)
 
     def read(self) -> Rows:
@@ -83,25 +81,32 @@ def concatenate(parts: list[Rows]) -> Rows:
 
 
 def _to_batch(rows: Rows) -> pa.RecordBatch:
-    records = np.ascontiguousarray(rows.records)
-    width = records.dtype.itemsize
-    packed = pa.Array.from_buffers(
-        pa.binary(width), len(records), [None, pa.py_buffer(records.view(np.uint8))]
-    )
-    x, y, z = (pa.array(np.ascontiguousarray(rows.xyz[:, axis])) for axis in range(3))
-    return pa.record_batch([pa.array(rows.row), x, y, z, packed], names=list("nxyzp"))
+    columns = [pa.array(rows.row), _packed(rows.xyz), _packed(rows.records)]
+    return pa.record_batch(columns, names=list(Rows._fields))
 
 
-def _read_stream(file: IO[bytes], layout: np.dtype[Any]) -> Iterator[Rows]:
+def _packed(values: NDArray[Any]) -> pa.Array:
+    """Return an array of rows, whatever they hold, as a column of bytes: no copy is made."""
+    held = np.ascontiguousarray(values)
+    width = held.nbytes // max(len(held), 1)
+    data = pa.py_buffer(held.reshape(-1).view(np.uint8))
+    return pa.Array.from_buffers(pa.binary(width), len(held), [None, data])
+
+
+def _unpacked(column: pa.Array, layout: np.dtype[Any]) -> NDArray[Any]:
+    """Return the rows of a column of bytes."""
+    width = column.type.byte_width
+    start = column.offset * width
+    data = column.buffers()[1][start : start + len(column) * width]
+    return np.frombuffer(data, dtype=layout)
+
+
+def _read_stream(file: pa.NativeFile, layout: np.dtype[Any]) -> Iterator[Rows]:
     for batch in pa.ipc.open_stream(file):
-        columns = [batch.column(name).to_numpy(zero_copy_only=True) for name in "xyz"]
-        packed = batch.column("p")
-        start = packed.offset * layout.itemsize
-        data = packed.buffers()[1][start : start + len(packed) * layout.itemsize]
         yield Rows(
-            row=batch.column("n").to_numpy(zero_copy_only=True),
-            xyz=np.stack(columns, axis=1),
-            records=np.frombuffer(data, dtype=layout),
+            row=batch.column("row").to_numpy(zero_copy_only=True),
+            xyz=_unpacked(batch.column("xyz"), np.dtype(np.float64)).reshape(-1, 3),
+            records=_unpacked(batch.column("records"), layout),
         )
 
 
