@@ -167,10 +167,10 @@ def refuse_full_work_disk(plan: Plan, work: Path) -> None:
     Raises
     ------
     OutputError
-        The disk of `work` has less free than half of the upper bound, for what is written
-        meanwhile and the result, which lies beside it as a rule: both are compressed.
+        The disk of `work` has less free than what is written meanwhile takes, or than half of the
+        upper bound of that and the result, which lies beside it as a rule and is compressed.
     """
-    need = (plan.work_bytes + plan.out_bytes) // 2
+    need = max(plan.work_bytes, (plan.work_bytes + plan.out_bytes) // 2)
     folder = next(path for path in (work, *work.absolute().parents) if path.is_dir())
     free = shutil.disk_usage(folder).free
     if need > free:

@@ -21,8 +21,8 @@ Way = Literal["in memory", "on tiles", "too large"]
 
 # CPU seconds per million points, measured on one core (LAZ, a scanned hall of 3e6 points; what
 # follows the filters: benchmarks/large_site.py at 1e7).
-_READ, _TILES, _WRITE, _MERGE, _HASH = 0.6, 2.0, 1.4, 1.5, 0.4
-_FILTER = {"lidar": 4.6, "photogrammetry": 3.9}
+_READ, _TILES, _WRITE, _MERGE, _HASH = 0.6, 1.2, 1.4, 1.5, 0.4
+_FILTER = {"lidar": 3.6, "photogrammetry": 3.9}
 _PAIR_SECONDS, _DISTANCE_SECONDS, _REPORT_SECONDS = 20.0, 4.0, 5.0
 _SPOOL_ROW_BYTES = 32
 """Of a point on disk beside its record: its place and its coordinates."""
@@ -52,7 +52,7 @@ class PlannedStage:
     """About so many; 0: in memory."""
     memory_bytes: int
     work_bytes: int
-    """Disk in use meanwhile, before compression."""
+    """Disk in use meanwhile."""
     seconds: float
     """CPU seconds."""
 
