@@ -196,3 +196,17 @@ def test_a_heap_of_duplicates_costs_no_visit_of_all_for_each(by):
         statistical(points, params)
         seconds.append(time.process_time() - start)
     assert seconds[1] < 10 * seconds[0] + 0.5
+
+
+@pytest.mark.parametrize("limit_m", [np.inf, 0.2])
+@pytest.mark.parametrize("k", [1, 12, 33])
+def test_leaves_that_reach_far_and_heaps_find_the_same_neighbours(k, limit_m):
+    rng = np.random.default_rng(4)
+    heavy = rng.normal(size=(4000, 3)) ** 5
+    heap = np.repeat(rng.random((3, 3)), [700, 40, 2], axis=0)
+    points = np.concatenate([heavy, heap, rng.random((1500, 3)) * [1.0, 1.0, 0.0]])
+    index = nb.build_index(points)
+    _, distance = nb.knn(index, None, k, limit_m)
+    wanted = cKDTree(points).query(points, k + 1)[0][:, 1:]
+    wanted[wanted > limit_m] = np.inf
+    np.testing.assert_allclose(distance, wanted, rtol=1e-12)

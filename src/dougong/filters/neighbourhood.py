@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from dougong._boxes import corners_of
 from dougong._checks import as_points
 from dougong.errors import InputError
-from dougong.kernels import boxtree, moments, neighbours, order
+from dougong.kernels import boxtree, moments, neighbours, order, self_neighbours
 from dougong.threads import for_blocks
 from dougong.typing import Index, Points, Values
 
@@ -254,7 +254,9 @@ def self_knn_block(
     start, stop = first_leaf * n // leaves, last_leaf * n // leaves
     places = np.empty((stop - start, k), np.int64)
     distance2 = np.empty((stop - start, k))
-    neighbours.self_knn(index.points, index.boxes, limit2, first_leaf, last_leaf, places, distance2)
+    self_neighbours.self_knn(
+        index.points, index.boxes, limit2, first_leaf, last_leaf, places, distance2
+    )
     return start, places, distance2
 
 

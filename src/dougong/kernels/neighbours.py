@@ -71,7 +71,7 @@ def nearest(
 
 
 @kernel
-def _insert(points: Floats, places: Ints, d2s: Floats, held: int, i: int, d2: float) -> int:
+def insert(points: Floats, places: Ints, d2s: Floats, held: int, i: int, d2: float) -> int:
     """Put point i at squared distance d2 into the sorted lists (k,); return how many they hold."""
     k = d2s.shape[0]
     at = held if held < k else k - 1
@@ -89,7 +89,7 @@ def _insert(points: Floats, places: Ints, d2s: Floats, held: int, i: int, d2: fl
 
 
 @kernel
-def _scan_leaf(
+def scan_leaf(
     points: Floats,
     leaf: int,
     leaves: int,
@@ -114,13 +114,13 @@ def _scan_leaf(
             continue
         if d2 == worst and held > last and comes_first(points, places[last], i):
             continue
-        held = _insert(points, places, d2s, held, i, d2)
+        held = insert(points, places, d2s, held, i, d2)
         worst = d2s[last]
     return held
 
 
 @kernel
-def _descend(
+def descend(
     points: Floats,
     boxes: Floats,
     root: int,
@@ -162,7 +162,7 @@ def _descend(
                 break
             node = near
         if node >= leaves:
-            held = _scan_leaf(points, node - leaves, leaves, x, y, z, skip, places, d2s, held)
+            held = scan_leaf(points, node - leaves, leaves, x, y, z, skip, places, d2s, held)
     return held
 
 
@@ -187,7 +187,7 @@ def knn(
     near_d2 = np.empty(k, np.float64)
     for q in range(queries.shape[0]):
         near_d2[:] = max_distance2
-        held = _descend(
+        held = descend(
             points,
             boxes,
             1,
@@ -205,47 +205,6 @@ def knn(
         d2s[q, :held] = near_d2[:held]
         places[q, held:] = -1
         d2s[q, held:] = np.inf
-
-
-@kernel
-def self_knn(
-    points: Floats,
-    boxes: Floats,
-    max_distance2: float,
-    first_leaf: int,
-    last_leaf: int,
-    places: Ints,
-    d2s: Floats,
-) -> None:
-    """Find the k nearest *other* points of the sorted points in leaves first_leaf .. last_leaf - 1.
-
-    Rows follow the sorted order, from the first point of first_leaf: places and d2s (m, k).
-    Climbs from the point's own leaf, so most of the tree is never looked at.
-    """
-    n = points.shape[0]
-    leaves = boxes.shape[0] // 2
-    stack = np.empty(_DEPTH, np.int64)
-    bound = np.empty(_DEPTH, np.float64)
-    k = d2s.shape[1]
-    near = np.empty(k, np.int64)
-    near_d2 = np.empty(k, np.float64)
-    row = 0
-    for leaf in range(first_leaf, last_leaf):
-        for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            near_d2[:] = max_distance2
-            held = _scan_leaf(points, leaf, leaves, x, y, z, i, near, near_d2, 0)
-            node = leaves + leaf
-            while node > 1:
-                held = _descend(
-                    points, boxes, node ^ 1, x, y, z, i, stack, bound, near, near_d2, held
-                )
-                node >>= 1
-            places[row, :held] = near[:held]
-            d2s[row, :held] = near_d2[:held]
-            places[row, held:] = -1
-            d2s[row, held:] = np.inf
-            row += 1
 
 
 @kernel
