@@ -168,6 +168,13 @@ def test_what_cannot_be_known_is_no_clutter():
         Clutter(person_height_m=(2.0, 1.0))
 
 
+def test_few_points_of_any_height_are_taken():
+    few = np.array([[0.0, 0, 0.1], [3.0, 0, 2.0]])
+    for points in (few, few[:1], few[1:], np.repeat(few[1:], 30, axis=0)):
+        found = clutter(points, height_above_ground=points[:, 2])
+        assert not found.attributes["clutter_kind"].any()
+
+
 def test_a_pole_under_a_roof_is_a_column():
     pole = sampled(block((0, 0, 0), (0.08, 0.08, 3.0)))[0]
     roof = sampled(block((0, 0, 3.6), (6.0, 6.0, 0.2)), 200.0)[0]

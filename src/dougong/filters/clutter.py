@@ -59,8 +59,8 @@ class Clutter(Parameters):
     """Shorter side."""
     pole_height_m: Limits = (2.2, 8.0)
     """Top of a pole above the ground."""
-    pole_radius_m: Annotated[float, Field(gt=0)] = 0.12
-    """Root mean square radius that half of a pole's layers stay within: columns are thicker."""
+    pole_radius_m: Annotated[float, Field(gt=0)] = 0.14
+    """Half of a pole's layers stay within this radius: columns are thicker."""
     pole_clear_m: Annotated[float, Field(ge=0)] = 1.0
     """A pole is at least this far from everything longer than 3 m, or it may carry a roof."""
     wire_height_m: Annotated[float, Field(gt=0)] = 2.5

@@ -104,7 +104,7 @@ def _vehicle(s: Shape, p: Clutter) -> float:
 def _pole(s: Shape, p: Clutter) -> float:
     return min(
         between(s.top_m, p.pole_height_m),
-        at_most(s.median_m, p.pole_radius_m),
+        at_most(s.girth_m, p.pole_radius_m),
         at_most(s.foot_m, POLE_FOOT * p.pole_radius_m),
-        at_least(s.top_m, 2.0 * SLENDER * s.median_m),
+        at_least(s.top_m, 2.0 * SLENDER * s.girth_m),
     )

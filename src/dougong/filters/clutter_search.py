@@ -101,17 +101,23 @@ def _site(xyz: Points, place: Index, eighth: Values, low: Index, p: Clutter) -> 
     index = build_index(xyz[place])
     gap = np.clip(GAP_SPACINGS * spacing_of(eighth[index.order]), p.gap_least_m, p.gap_most_m)
     clusters = clusters_of(index, gap, p.gap_least_m)
-    beside: dict[int, Index] = {}
-    if len(low) and len(place):
-        at, _ = nearest(index, xyz[low], p.gap_least_m)
-        low, at = low[at >= 0], at[at >= 0]
-        sorted_place = np.empty(len(place), np.int64)
-        sorted_place[index.order] = np.arange(len(place))
-        root = clusters.root[sorted_place[at]]
-        order = np.argsort(root, kind="stable")
-        roots, starts = np.unique(root[order], return_index=True)
-        beside = dict(zip(roots.tolist(), np.split(low[order], starts[1:]), strict=True))
-    return _Site(index, place[index.order], clusters, beside)
+    return _Site(index, place[index.order], clusters, _beside(index, clusters, xyz, low, p))
+
+
+def _beside(
+    index: Neighbourhood, clusters: Clusters, xyz: Points, low: Index, p: Clutter
+) -> dict[int, Index]:
+    """Return the `low` points beside each cluster, by its root: near enough to one of it."""
+    at, _ = nearest(index, xyz[low], p.gap_least_m)
+    low, at = low[at >= 0], at[at >= 0]
+    if not len(low):
+        return {}
+    sorted_place = np.empty(len(index.order), np.int64)
+    sorted_place[index.order] = np.arange(len(index.order))
+    root = clusters.root[sorted_place[at]]
+    order = np.argsort(root, kind="stable")
+    roots, starts = np.unique(root[order], return_index=True)
+    return dict(zip(roots.tolist(), np.split(low[order], starts[1:]), strict=True))
 
 
 def _offered(

@@ -19,6 +19,9 @@ HEAD_M, FOOT_M = 0.25, 0.36
 """The head is the uppermost so many metres, the foot the lowest."""
 SOLE_M = 0.12
 """The foot is looked at in layers so thin: a plinth may be low."""
+STEP, STEP_POINTS = 0.25, 12
+"""A layer of the foot with a gap this share of its length is two feet, not a plinth; one of fewer
+points than this is taken for a plinth."""
 
 
 class Shape(NamedTuple):
@@ -35,9 +38,12 @@ class Shape(NamedTuple):
     body_m: float
     """The same of the widest layer of the upper half, the head apart."""
     foot_m: float
-    """The same of the widest thin layer of the foot."""
+    """The same of the widest thin layer of the foot; 0 where all of them are two feet."""
     median_m: float
     """The same, of the layer that half of the layers are thinner than."""
+    girth_m: float
+    """How far from the middle of a layer nine in ten of its points lie, in the layer that half are
+    thinner than: the radius of a shaft, about, whether it is seen from all sides or from one."""
     filled: float
     """Share of the layers from low to top that hold points."""
 
@@ -55,7 +61,9 @@ def shape_of(points: Points, height: Values) -> Shape:
     hull = np.empty(2 * len(plan), np.int64)
     length, width = kernels.least_rectangle(plan, hull[: kernels.plan_hull(plan, hull)])
     low, top = float(h.min()), float(h.max())
-    spread, filled = _layers(plan, h, low, top)
+    layers = _layers(plan, h, low, top)
+    spread = np.array([_spread(layer) for layer in layers])
+    girth = [_reach(layer) for layer in layers if len(layer)]
     upper = spread[len(spread) // 2 : max(len(spread) - 1, 1)]
     return Shape(
         points=len(points),
@@ -67,7 +75,8 @@ def shape_of(points: Points, height: Values) -> Shape:
         body_m=float(np.nanmax(upper)) if np.isfinite(upper).any() else 0.0,
         foot_m=_foot(plan, h - low),
         median_m=float(np.nanmedian(spread)),
-        filled=filled,
+        girth_m=float(np.median(girth)),
+        filled=float(np.isfinite(spread).mean()),
     )
 
 
@@ -79,16 +88,34 @@ def _spread(plan: Values) -> float:
     return float(np.sqrt((off * off).sum(axis=1).mean()))
 
 
+def _reach(plan: Values) -> float:
+    """Return how far from their mean nine in ten of some places (n, 2) lie at most."""
+    off = plan - plan.mean(axis=0)
+    distance2 = np.sort((off * off).sum(axis=1))
+    return float(np.sqrt(distance2[int(np.ceil(0.9 * len(plan))) - 1]))
+
+
 def _foot(plan: Values, above: Values) -> float:
-    """Return the spread of the widest thin layer of the lowest `FOOT_M`."""
+    """Return the spread of the widest thin layer of the lowest `FOOT_M` that is one piece."""
     is_foot = above < FOOT_M
     layer = (above[is_foot] / SOLE_M).astype(np.int64)
-    return max(_spread(plan[is_foot][layer == k]) for k in np.unique(layer))
+    parts = [plan[is_foot][layer == k] for k in np.unique(layer)]
+    return max((_spread(part) for part in parts if not _is_parted(part)), default=0.0)
 
 
-def _layers(plan: Values, height: Values, low: float, top: float) -> tuple[Values, float]:
-    """Return the spread of every layer from the lowest up, NaN where empty, and those filled."""
+def _is_parted(plan: Values) -> bool:
+    """Say whether places (n, 2) leave a wide gap along their longer axis."""
+    if len(plan) < STEP_POINTS:
+        return False
+    off = plan - plan.mean(axis=0)
+    xx, yy, xy = (off[:, 0] ** 2).sum(), (off[:, 1] ** 2).sum(), (off[:, 0] * off[:, 1]).sum()
+    turn = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    along = np.sort(off[:, 0] * np.cos(turn) + off[:, 1] * np.sin(turn))
+    return bool(np.diff(along).max() > STEP * (along[-1] - along[0]))
+
+
+def _layers(plan: Values, height: Values, low: float, top: float) -> list[Values]:
+    """Return the places of every layer from the lowest up."""
     count = max(1, int(np.ceil((top - low) / LAYER_M)))
     layer = np.minimum(((height - low) / LAYER_M).astype(np.int64), count - 1)
-    spread = np.array([_spread(plan[layer == k]) for k in range(count)])
-    return spread, float(np.isfinite(spread).mean())
+    return [plan[layer == k] for k in range(count)]

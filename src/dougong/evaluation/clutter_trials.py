@@ -1,0 +1,137 @@
+"""What the clutter filter takes for what, on generated sites whose every point knows what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from dougong.evaluation.clutter_site import ClutterSite, clutter_site
+from dougong.evaluation.clutter_things import PERSON, POLE, THINGS, VEHICLE, WIRE
+from dougong.evaluation.mesh import CLUSTER, FINE, MIXED, NEAR_NOISE, OUTLIER, SURFACE, VEGETATION
+from dougong.filters.cloth_simulation import GROUND, ClothSimulation, cloth_simulation
+from dougong.filters.clutter import Clutter, clutter
+from dougong.filters.clutter_kinds import ClutterKind
+from dougong.filters.curvature_weighted import curvature_weighted
+from dougong.filters.low_outliers import low_outliers
+
+LEAST_POINTS = 50
+"""Things that fewer points were left of are not counted."""
+TRUE_KIND = {
+    PERSON: ClutterKind.PERSON,
+    VEHICLE: ClutterKind.VEHICLE,
+    POLE: ClutterKind.POLE,
+    WIRE: ClutterKind.WIRE,
+}
+_NOISE = (OUTLIER, NEAR_NOISE, MIXED, CLUSTER)
+_STILL = {"building": (SURFACE, FINE), "vegetation": (VEGETATION,), "noise": _NOISE}
+
+
+def trial(
+    kind: str, seed: int, points: int = 1_500_000, params: Clutter | None = None
+) -> list[dict[str, Any]]:
+    """Generate a site, filter it as a laser scan's recipe does, and say what was taken for what.
+
+    Returns
+    -------
+    list of dict
+        A row per thing that `LEAST_POINTS` or more points off the ground were left of (``thing``,
+        ``points``, ``taken_for``: the kind that most of them got), and a row per sort of points
+        (``points_on``, and under each kind how many were taken for it).
+    """
+    site = clutter_site(kind, seed, points)
+    left, height = _off_ground(site)
+    found = clutter(site.points[left], params, height_above_ground=height)
+    kinds = found.attributes["clutter_kind"]
+    labels, things = site.labels[left], site.things[left]
+    about = {"building": kind, "seed": seed}
+    rows: list[dict[str, Any]] = []
+    for number in np.unique(things[things >= 0]):
+        on = things == number
+        if on.sum() < LEAST_POINTS:
+            continue
+        counts = np.bincount(kinds[on], minlength=len(ClutterKind))
+        best = int(np.argmax(counts[1:])) + 1
+        is_taken = 2 * counts[1:].sum() > on.sum()
+        rows.append(
+            {
+                **about,
+                "thing": THINGS[int(labels[on][0])],
+                "points": int(on.sum()),
+                "taken_for": ClutterKind(best if is_taken else 0).name.lower(),
+            }
+        )
+    sorts: dict[str, tuple[int, ...]] = {**_STILL, **{name: (k,) for k, name in THINGS.items()}}
+    for name, those in sorts.items():
+        counts = np.bincount(kinds[np.isin(labels, those)], minlength=len(ClutterKind))
+        taken = {k.name.lower(): int(counts[k]) for k in ClutterKind}
+        rows.append({**about, "points_on": name, **taken})
+    return rows
+
+
+def _off_ground(site: ClutterSite) -> tuple[Any, Any]:
+    """Return the points that the recipe leaves off the ground, and their heights."""
+    left = np.flatnonzero(low_outliers(site.points).is_kept)
+    cloth = cloth_simulation(site.points[left], ClothSimulation(class_threshold_m=0.09))
+    is_off = cloth.attributes["ground_class"] != GROUND
+    left, height = left[is_off], cloth.attributes["height_above_ground"][is_off]
+    is_kept = curvature_weighted(site.points[left]).is_kept
+    return left[is_kept], height[is_kept]
+
+
+def thing_table(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return a row per sort of thing: how many there were, and what they were taken for."""
+    table = []
+    own = [row for row in rows if "thing" in row]
+    for name in THINGS.values():
+        some = [row["taken_for"] for row in own if row["thing"] == name]
+        if name == "wire":
+            continue
+        line: dict[str, Any] = {"thing": name, "n": len(some)}
+        line |= {k.name.lower(): some.count(k.name.lower()) for k in ClutterKind}
+        table.append(line)
+    return table
+
+
+def point_table(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return a row per sort of points: how many there were, and what they were taken for."""
+    own = [row for row in rows if "points_on" in row]
+    table = []
+    for name in dict.fromkeys(row["points_on"] for row in own):
+        some = [row for row in own if row["points_on"] == name]
+        sums = {k.name.lower(): sum(row[k.name.lower()] for row in some) for k in ClutterKind}
+        table.append({"points on": name, "n": sum(sums.values()), **sums})
+    return table
+
+
+def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return recall and precision, percent, per kind.
+
+    By things: of the true ones, those found; of the things taken for it, true ones. By points: the
+    same of points, noise apart. Wires are counted by points alone.
+    """
+    things, points = thing_table(rows), point_table(rows)
+    table = []
+    for label, kind in TRUE_KIND.items():
+        name = kind.name.lower()
+        of_it = {line["thing"]: line[name] for line in things}
+        there = {line["thing"]: line["n"] for line in things}
+        on_it = {line["points on"]: line[name] for line in points if line["points on"] != "noise"}
+        all_on = next(line["n"] for line in points if line["points on"] == THINGS[label])
+        table.append(
+            {
+                "kind": name,
+                "n": there.get(name, 0),
+                "recall %": _share(of_it.get(name, 0), there.get(name, 0)),
+                "precision %": _share(of_it.get(name, 0), sum(of_it.values())),
+                "points": all_on,
+                "point recall %": _share(on_it[name], all_on),
+                "point precision %": _share(on_it[name], sum(on_it.values())),
+            }
+        )
+    return table
+
+
+def _share(part: int, whole: int) -> float:
+    return 100.0 * part / whole if whole else float("nan")
