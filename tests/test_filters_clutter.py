@@ -168,6 +168,14 @@ def test_what_cannot_be_known_is_no_clutter():
         Clutter(person_height_m=(2.0, 1.0))
 
 
+def test_rows_of_a_scanner_are_no_wires():
+    along = np.arange(0, 12, 0.05)
+    rows = [np.column_stack([along, 0 * along, 0 * along + z]) for z in np.arange(0.2, 9, 0.8)]
+    _, found = kinds_of(np.concatenate(rows))
+    assert not found.attributes["clutter_kind"].any()
+    assert "rows" in found.notes[0]
+
+
 def test_few_points_of_any_height_are_taken():
     few = np.array([[0.0, 0, 0.1], [3.0, 0, 2.0]])
     for points in (few, few[:1], few[1:], np.repeat(few[1:], 30, axis=0)):

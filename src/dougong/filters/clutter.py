@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +22,10 @@ from dougong.filters.clutter_kinds import ClutterKind
 from dougong.filters.selection import Selection
 from dougong.params import Parameters
 
-KIND: Literal["local", "two-pass", "global"] = "local"
+if TYPE_CHECKING:
+    from dougong.filters.clutter_search import Whole
+
+KIND: Literal["local", "two-pass", "global"] = "two-pass"
 
 Limits = tuple[float, float]
 Name = Literal["person", "vehicle", "pole", "wire"]
@@ -97,7 +100,7 @@ def clutter(
     params: Clutter | None = None,
     *,
     height_above_ground: ArrayLike,
-    own: int | None = None,
+    whole: Whole | None = None,
 ) -> Selection:
     """Find what stands about: people, vehicles, poles and wires.
 
@@ -109,8 +112,8 @@ def clutter(
     height_above_ground : array_like, shape (n,)
         Metres, from the cloth filter. A cluster with a point of unknown height (NaN) is never
         clutter.
-    own : int, optional
-        Where the points are a part of a cloud: the first so many are its own, the others its halo.
+    whole : Whole, optional
+        Where the points are a part of a cloud: what must be known of it.
 
     Returns
     -------
@@ -126,7 +129,9 @@ def clutter(
 
     Notes
     -----
-    Tile class: local, halo of `halo_m`. Nothing depends on the order of the points.
+    Tile class: two-pass, halo of `halo_m`; the first pass counts how many points lie on thin lines.
+    Where these are too many, they are the rows of the scanner and no wires are offered. Nothing
+    depends on the order of the points.
     """
     from dougong.filters.clutter_search import nothing, search
 
@@ -140,19 +145,19 @@ def clutter(
         raise InputError(msg)
     found = nothing(len(xyz))
     if p.action != "off" and len(xyz):
-        found = search(xyz, height, p, len(xyz) if own is None else own)
+        found = search(xyz, height, p, whole)
     is_kept = np.ones(len(xyz), bool)
     if p.action == "remove":
         is_kept = found.kind == ClutterKind.NONE
     return Selection(
         is_kept=is_kept,
         attributes={"clutter_kind": found.kind, "clutter_margin": found.margin},
-        notes=clutter_notes(found.counts),
+        notes=clutter_notes(found.counts, found.has_rows and "wire" in p.kinds),
         found=found.counts,
     )
 
 
-def clutter_notes(found: Mapping[str, int]) -> tuple[str, ...]:
+def clutter_notes(found: Mapping[str, int], has_rows: bool) -> tuple[str, ...]:
     """Return what is to be said of the clusters and points found per kind."""
     said = []
     for kind in ClutterKind:
@@ -162,4 +167,10 @@ def clutter_notes(found: Mapping[str, int]) -> tuple[str, ...]:
         clusters = found.get(f"{kind.name.lower()}_clusters")
         many = "points" if clusters is None else f"{clusters} clusters, points"
         said.append(f"like a {kind.name.lower()}: {many} {points}")
-    return (f"offered as clutter: {'; '.join(said)}",) if said else ()
+    notes = [f"offered as clutter: {'; '.join(said)}"] if said else []
+    if has_rows:
+        notes.append(
+            "wires were not looked for: many points lie on thin lines as it is, which are the "
+            "scanner's rows"
+        )
+    return tuple(notes)

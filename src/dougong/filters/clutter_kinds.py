@@ -36,6 +36,10 @@ POLE_FOOT = 1.5
 """The foot of a pole is at most so many times `pole_radius_m` wide to either side."""
 
 
+PERSON_PITCH_M, VEHICLE_PITCH_M = 0.13, 0.20
+"""Points farther apart than this show no shape: bushes and rocks have such sizes too."""
+
+
 class ClutterKind(IntEnum):
     """What a point was taken for: attribute ``clutter_kind``, written as ``dougong_clutter``."""
 
@@ -88,6 +92,7 @@ def _person(s: Shape, p: Clutter) -> float:
         at_least(s.body_m, SHOULDERS * s.head_m),
         at_most(s.foot_m, PLINTH * s.body_m),
         at_most(s.median_m, WAIST * s.body_m),
+        at_most(s.pitch_m, PERSON_PITCH_M),
     )
 
 
@@ -98,6 +103,7 @@ def _vehicle(s: Shape, p: Clutter) -> float:
         between(s.width_m, p.vehicle_width_m),
         at_least(s.head_m, CABIN_M),
         at_least(s.length_m, OBLONG * s.width_m),
+        at_most(s.pitch_m, VEHICLE_PITCH_M),
     )
 
 

@@ -30,8 +30,19 @@ if TYPE_CHECKING:
 
 STRUCTURE_M = 3.0
 """A pole must stand clear of clusters longer than this."""
+LINES_HALO_M = wires.BALL_M
+"""How far `count_lines` reaches, beside `gap_most_m`."""
 GAP_SPACINGS = 5.0
 """Points of a cluster are at most so many spacings from one another."""
+
+
+class Whole(NamedTuple):
+    """What the search must know of a cloud to look at a part of it, its halo included."""
+
+    own: int
+    """The first so many points are the part's own."""
+    has_rows: bool
+    """Whether thin lines are the scanner's rows (`wires.are_rows` of the whole cloud)."""
 
 
 class Found(NamedTuple):
@@ -41,6 +52,8 @@ class Found(NamedTuple):
     margin: Values
     counts: dict[str, int]
     """Own clusters and points by kind: ``person_clusters``, ``person_points`` ..."""
+    has_rows: bool = False
+    """Wires were not looked for: the scanner's rows would be taken for them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,20 +79,51 @@ def nothing(points: int) -> Found:
     return Found(np.zeros(points, np.uint8), np.zeros(points), {})
 
 
-def search(xyz: Points, height: Values, p: Clutter, own: int) -> Found:
-    """Look for clutter among points (n, 3) of known `height` (n,); the first `own` count."""
-    kind, margin, counts = nothing(len(xyz))
-    is_low = height < p.foot_m
-    up = np.flatnonzero(~is_low)
+@dataclass(frozen=True, slots=True)
+class _Upper:
+    """The points that do not lie near the ground, in the order of an index."""
+
+    index: Neighbourhood
+    place: Index
+    """(m,) place of each in the caller's array."""
+    eighth_m: Values
+    lines: wires.Lines
+
+
+def _upper(xyz: Points, height: Values, p: Clutter) -> _Upper:
+    up = np.flatnonzero(~(height < p.foot_m))
     index = build_index(xyz[up])
+    place = up[index.order]
     eighth = eighth_nearest(index, p.gap_most_m)
-    run = wires.runs_of_wires(index, height[up][index.order], eighth, p.wire_height_m)
-    is_wire = run >= p.wire_length_m
-    if "wire" in p.kinds:
+    lines = wires.thin_lines(index, height[place], eighth, p.wire_height_m)
+    return _Upper(index, place, eighth, lines)
+
+
+def count_lines(xyz: Points, height: Values, p: Clutter, own: int) -> tuple[int, int]:
+    """Return how many of the first `own` points are high, and how many of these on thin lines."""
+    upper = _upper(xyz, height, p)
+    return upper.lines.counts(upper.place < own)
+
+
+def search(xyz: Points, height: Values, p: Clutter, whole: Whole | None = None) -> Found:
+    """Look for clutter among points (n, 3) of `height` (n,): a cloud, or the part of a `whole`."""
+    kind, margin, counts, _ = nothing(len(xyz))
+    upper = _upper(xyz, height, p)
+    place = upper.place
+    if whole is None:
+        every = np.ones(len(place), bool)
+        whole = Whole(len(xyz), wires.are_rows(*upper.lines.counts(every)))
+    own = whole.own
+    is_wire = np.zeros(len(place), bool)
+    if not whole.has_rows:
+        run = wires.runs_of_wires(upper.index, upper.lines)
+        is_wire = run >= p.wire_length_m
+    if "wire" in p.kinds and is_wire.any():
         along = (run[is_wire] - p.wire_length_m) / p.wire_length_m
-        chosen = up[index.order[is_wire]][along >= p.min_margin]
+        chosen = place[is_wire][along >= p.min_margin]
         kind[chosen], margin[chosen] = ClutterKind.WIRE, along[along >= p.min_margin]
-    site = _site(xyz, up[index.order[~is_wire]], eighth[~is_wire], np.flatnonzero(is_low), p)
+    low = np.flatnonzero(height < p.foot_m)
+    site = _site(xyz, place[~is_wire], upper.eighth_m[~is_wire], low, p)
     for places, found, share in _offered(site, xyz, height, p, own):
         kind[places], margin[places] = found, share
         # A cluster that several parts of a cloud see belongs to one: that of its first point.
@@ -88,7 +132,7 @@ def search(xyz: Points, height: Values, p: Clutter, own: int) -> Found:
         if found != ClutterKind.NONE:
             points = int(np.count_nonzero(kind[:own] == found))
             _count(counts, f"{found.name.lower()}_points", points)
-    return Found(kind, margin, counts)
+    return Found(kind, margin, counts, whole.has_rows)
 
 
 def _count(counts: dict[str, int], name: str, more: int) -> None:

@@ -44,6 +44,8 @@ class Shape(NamedTuple):
     girth_m: float
     """How far from the middle of a layer nine in ten of its points lie, in the layer that half are
     thinner than: the radius of a shaft, about, whether it is seen from all sides or from one."""
+    pitch_m: float
+    """Side of the square of its longest face that each point stands for."""
     filled: float
     """Share of the layers from low to top that hold points."""
 
@@ -76,6 +78,7 @@ def shape_of(points: Points, height: Values) -> Shape:
         foot_m=_foot(plan, h - low),
         median_m=float(np.nanmedian(spread)),
         girth_m=float(np.median(girth)),
+        pitch_m=float(np.sqrt(length * (top - low) / len(points))),
         filled=float(np.isfinite(spread).mean()),
     )
 

@@ -72,7 +72,7 @@ FILTERS = MappingProxyType(
             ),
             FilterSpec("statistical", "Statistical", Reason.STATISTICAL, "two-pass"),
             FilterSpec("radius", "Radius", Reason.RADIUS, "local"),
-            FilterSpec("clutter", "Clutter", Reason.CLUTTER, "local", ("height_above_ground",)),
+            FilterSpec("clutter", "Clutter", Reason.CLUTTER, "two-pass", ("height_above_ground",)),
             FilterSpec(
                 "pass_through",
                 "PassThrough",

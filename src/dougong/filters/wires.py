@@ -5,12 +5,14 @@ Kernels are imported when called.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from dougong.filters.clusters import NEIGHBOURS
 from dougong.filters.neighbourhood import Neighbourhood, build_index, count_within
 from dougong.threads import for_blocks
-from dougong.typing import Index, Values
+from dougong.typing import Index, Mask, Values
 
 BALL_M = 0.3
 """In this ball round a point of a wire there is nothing but the wire ..."""
@@ -30,7 +32,30 @@ STEP_M = 0.4
 """... with no longer gap than this, ..."""
 SPREAD = 0.1
 """... this much farther off the line per metre: it hangs, and its direction is uncertain."""
+ROWS = 0.15
+"""Where more of the high points than this lie on thin lines, these are the scanner's own rows, too
+far apart to tell a wire by."""
 _BLOCK = 1 << 12
+
+
+class Lines(NamedTuple):
+    """The points of an index that lie on thin lines; places in sorted order."""
+
+    place: Index
+    """(m,)"""
+    line: Values
+    """(m, 3) unit directions."""
+    high: Mask
+    """(n,) the points that were looked at: those high enough over the ground."""
+
+    def counts(self, is_own: Mask) -> tuple[int, int]:
+        """Return how many of the own points (n,) are high, and how many of these on lines."""
+        return int((self.high & is_own).sum()), int(is_own[self.place].sum())
+
+
+def are_rows(high: int, on_lines: int) -> bool:
+    """Say whether so many of the `high` points of a cloud on lines are the scanner's rows."""
+    return on_lines > ROWS * high
 
 
 def halo_m() -> float:
@@ -38,8 +63,8 @@ def halo_m() -> float:
     return AHEAD_M + BALL_M
 
 
-def runs_of_wires(index: Neighbourhood, height: Values, eighth_m: Values, least_m: float) -> Values:
-    """Return how far a wire goes on from each point (n,), metres in steps; 0 where there is none.
+def thin_lines(index: Neighbourhood, height: Values, eighth_m: Values, least_m: float) -> Lines:
+    """Find the points that lie on thin lines at least `least_m` above the ground.
 
     Parameters
     ----------
@@ -49,16 +74,21 @@ def runs_of_wires(index: Neighbourhood, height: Values, eighth_m: Values, least_
     eighth_m : ndarray, shape (n,)
         Distance to the 8th nearest other.
     least_m : float
-        A wire hangs at least this high.
     """
+    high = height >= least_m
+    return Lines(*_on_thin_lines(index, np.flatnonzero(high), eighth_m), high)
+
+
+def runs_of_wires(index: Neighbourhood, lines: Lines) -> Values:
+    """Return how far a wire goes on from each point (n,), metres in steps; 0: there is none."""
     from dougong.kernels import clusters as kernels
 
     run = np.zeros(len(index.points))
-    asked, line = _on_thin_lines(index, np.flatnonzero(height >= least_m), eighth_m)
+    asked = lines.place
     if not len(asked):
         return run
     others = build_index(index.points[asked])
-    line = np.ascontiguousarray(line[others.order])
+    line = np.ascontiguousarray(lines.line[others.order])
     found = np.zeros(len(asked))
 
     def task(start: int, stop: int) -> None:

@@ -27,6 +27,7 @@ from dougong.filters.ranks import ValueBlocks, median
 from dougong.filters.selection import Reason
 from dougong.filters.statistical import Statistical, cut_distance, stray_notes
 from dougong.filters.totals import Totals
+from dougong.filters.wires import are_rows
 from dougong.params import Parameters
 from dougong.tiles import work
 from dougong.tiles.cloud import (
@@ -212,8 +213,11 @@ def _radius(stage: _Stage) -> Outcome:
 
 def _clutter(stage: _Stage) -> Outcome:
     assert isinstance(stage.params, Clutter)
-    records, key = stage.map("clutter", work.judge_clutter)
-    return records, clutter_notes(_found(records)), key
+    counted, _ = stage.map("thin_lines", work.count_lines)
+    has_rows = are_rows(_sum(counted, "high"), _sum(counted, "on_lines"))
+    records, key = stage.map("clutter", work.judge_clutter, has_rows)
+    is_said = has_rows and "wire" in stage.params.kinds
+    return records, clutter_notes(_found(records), is_said), key
 
 
 def _statistical(stage: _Stage) -> Outcome:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dougong._boxes import are_within
 from dougong.errors import InputError
+from dougong.filters import clutter_search
 from dougong.filters.cloth_simulation import UNKNOWN, Cloth, ClothSimulation, classify
 from dougong.filters.clutter import Clutter, clutter
 from dougong.filters.clutter import halo_m as clutter_halo_m
@@ -194,14 +195,27 @@ def judge_radius(job: Job) -> tuple[Arrays, Record]:
     return _booked(job, _own(radius(part.points, job.params), part.own), Reason.RADIUS)
 
 
-def judge_clutter(job: Job) -> tuple[Arrays, Record]:
-    """Offer what stands about, or take it out."""
+def count_lines(job: Job) -> tuple[Arrays, Record]:
+    """Count the high points of a tile, and those of them on thin lines."""
     assert isinstance(job.params, Clutter)
-    part = _with_halo(job, clutter_halo_m(job.params))
+    part = _with_halo(job, clutter_search.LINES_HALO_M + job.params.gap_most_m)
+    high, on_lines = clutter_search.count_lines(part.points, _height(part), job.params, part.own)
+    return {}, {"high": high, "on_lines": on_lines}
+
+
+def _height(part: Part) -> Values:
     if part.height is None:
         msg = "clutter needs heights above the ground; run cloth_simulation before it."
         raise InputError(msg)
-    found = clutter(part.points, job.params, height_above_ground=part.height, own=part.own)
+    return part.height
+
+
+def judge_clutter(job: Job) -> tuple[Arrays, Record]:
+    """Offer what stands about, or take it out; known: whether thin lines are the scanner's rows."""
+    assert isinstance(job.params, Clutter)
+    part = _with_halo(job, clutter_halo_m(job.params))
+    whole = clutter_search.Whole(part.own, job.known)
+    found = clutter(part.points, job.params, height_above_ground=_height(part), whole=whole)
     arrays, record = _booked(job, _own(found, part.own), Reason.CLUTTER)
     return arrays, {**record, "found": dict(found.found)}
 
