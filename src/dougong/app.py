@@ -149,7 +149,7 @@ def filter_file(
 ) -> Document:
     """Filter one file into another; see `dougong.pipeline.filtering.filter_file`."""
     from dougong.pipeline import filtering
-    from dougong.tiles.folder import folder_of
+    from dougong.tiles.shared import folder_of
 
     _say_if_cold(progress)
     return filtering.filter_file(
@@ -350,7 +350,7 @@ def _named(out: Path) -> Path:
 def _store(out: Path, work: str | None) -> Store:
     """Return where finished filter steps are kept: ``--work``, else a folder beside `out`."""
     from dougong.pipeline.store import Store
-    from dougong.tiles.folder import folder_of
+    from dougong.tiles.shared import folder_of
 
     if work is not None:
         return Store.kept(folder_of(work), out)

@@ -51,7 +51,8 @@ from dougong.pipeline.tiled import (
     stations_of,
     tiled_job,
 )
-from dougong.tiles.folder import Folder, LocalFolder, copies_in
+from dougong.tiles.folder import Folder, LocalFolder
+from dougong.tiles.shared import copies_in
 from dougong.typing import Kind
 
 Document = dict[str, Any]

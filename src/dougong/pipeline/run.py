@@ -36,7 +36,7 @@ from dougong.pipeline.scaling import load_all
 from dougong.pipeline.store import Store
 from dougong.pipeline.writing import write_clouds, write_registrations
 from dougong.registration.control_solve import ControlPoints
-from dougong.tiles.folder import copies_in
+from dougong.tiles.shared import copies_in
 
 _WORST = ("failed", "ambiguous", "ok")
 

@@ -7,13 +7,12 @@ run again; one that fails is tried once more, then named, and the others go on.
 import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
 from dougong.errors import DougongError, InputError, OutputError, TileError
-from dougong.threads import get_threads, set_threads
 from dougong.tiles.cloud import Arrays, Record, read_record, write_arrays
 from dougong.tiles.folder import Folder
 
@@ -78,7 +77,11 @@ class Engine:
                 error = future.exception()
                 if error is None:
                     records[number] = future.result()
-                elif tried < _TRIES and not isinstance(error, OutputError):
+                elif isinstance(error, OutputError):
+                    # The disk is full or the storage away: it is for the others too.
+                    failed[number] = error
+                    waiting.clear()
+                elif tried < _TRIES:
                     waiting.append((number, tried + 1))
                 else:
                     failed[number] = error
@@ -89,12 +92,16 @@ class Engine:
 
 def _told(failed: dict[int, BaseException], tasks: Sequence[Task]) -> DougongError:
     first = failed[min(failed)]
-    if isinstance(first, OutputError):
-        return first
+    for error in failed.values():
+        if isinstance(error, OutputError):
+            return error
     names = ", ".join(tasks[number].tile for number in sorted(failed)[:5])
+    more = ""
+    if isinstance(first, FileNotFoundError):
+        more = f"Every worker must see {tasks[0].folder}: mount it there, or use --work s3://. "
     error = TileError(
-        f"{len(failed)} of {len(tasks)} tiles failed twice ({names}): {first!r}. The others are "
-        "done: with --work the same command goes on with these."
+        f"{len(failed)} of {len(tasks)} tiles failed twice ({names}): {first!r}. {more}The others "
+        "are done: with --work the same command goes on with these."
     )
     error.__cause__ = first
     return error
@@ -124,29 +131,14 @@ def set_engine(name: str) -> None:
 @contextmanager
 def engine_in_use() -> Iterator[Engine]:
     """Yield the engine that was asked for."""
-    with local_engine() if _name == "local" else _dask_engine(_name) as engine:
-        yield engine
+    if _name == "local":
+        with local_engine() as engine:
+            yield engine
+        return
+    from dougong.tiles.cluster import executor_of
 
-
-@contextmanager
-def _dask_engine(name: str) -> Iterator[Engine]:
-    """Yield a Dask cluster: the one named, or processes of this machine, one per thread.
-
-    Workers of a cluster elsewhere must see the folder of ``--work`` under the same path.
-    """
-    from distributed import Client, LocalCluster
-
-    with ExitStack() as stack:
-        if name == "dask":
-            cluster = LocalCluster(
-                n_workers=get_threads(), threads_per_worker=1, dashboard_address=None
-            )
-            client = stack.enter_context(Client(stack.enter_context(cluster)))
-        else:
-            client = stack.enter_context(Client(name.replace("dask://", "tcp://"), timeout="10s"))
-        # A worker has one thread of its own; several tiles are its parallelism.
-        client.run(set_threads, 1)
-        yield Engine(client.get_executor(), max(1, sum(client.nthreads().values())))
+    with executor_of(_name) as (executor, width):
+        yield Engine(executor, width)
 
 
 @contextmanager
