@@ -20,7 +20,7 @@ from dougong.formats import (
 )
 from dougong.formats.model import Hold
 from dougong.params import Parameters
-from dougong.pipeline.marking import GROUND_CLASS, marked, with_classes, with_clutter
+from dougong.pipeline.marking import GROUND_CLASS, marked, marks_clutter, with_classes, with_clutter
 from dougong.pipeline.memory import Room
 from dougong.pipeline.outputs import refuse_output, watched, write_json
 from dougong.pipeline.progress import Progress
@@ -73,11 +73,6 @@ class FilterJob:
         assert self.kind is not None
         recipe = Recipe().model_copy(update={self.kind: self.params})
         return filter_cloud(cloud, self.kind, recipe, progress)
-
-    def marks_clutter(self) -> bool:
-        """Say whether the kept points tell what they were taken for."""
-        own = self.params if self.only == "clutter" else getattr(self.params, "clutter", None)
-        return getattr(own, "action", "") == "mark"
 
     def tiled(self) -> TiledJob:
         """Return the job as tiles do it."""
@@ -284,6 +279,6 @@ def _chosen(job: FilterJob, cloud: Cloud, filtered: Filtered, mark: bool) -> Clo
     if job.only == "cloth_simulation" and getattr(job.params, "keep", "") == "all":
         # Alone, the cloth takes nothing out: its answer is the class.
         return with_classes(filtered.cloud, [(filtered.is_ground, GROUND_CLASS)])
-    if job.marks_clutter():
+    if any(marks_clutter(step) for step in job.tiled().steps):
         return with_clutter(filtered)
     return filtered.cloud

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from dougong.cloud import Cloud
-from dougong.filters.selection import Reason
 from dougong.formats import describe, faults_of, in_system, read, read_stations
 from dougong.formats.faults import NO_SYSTEM
 from dougong.formats.model import Hold
 from dougong.pipeline.kept import Kept
+from dougong.pipeline.marking import marks_clutter, with_clutter
 from dougong.pipeline.memory import LEAST_TILE_POINTS, Room
 from dougong.pipeline.movers import Mover, Source, Tally
 from dougong.pipeline.progress import Progress
@@ -134,7 +134,7 @@ class Loader:
             books = self.store.load(key)
             if books is not None and len(books.codes) == len(cloud):
                 self._say_known(cloud.name)
-                kept = Kept.of(cloud.select(np.flatnonzero(books.codes == Reason.KEPT)))
+                kept = Kept.of(self._kept(entry, books.part(cloud, slice(None))))
                 removed = removed_sample(cloud, books.codes, details=books.details)
                 yield self._source(entry, file, station, kept, books, books.noticed, removed)
                 continue
@@ -143,7 +143,7 @@ class Loader:
                 filtered = filter_cloud(cloud, entry.kind, self.recipe, self.progress)
             self.store.save(key, filtered, noticed)
             removed = removed_sample(cloud, filtered.codes, details=filtered.details)
-            kept = Kept.of(filtered.cloud)
+            kept = Kept.of(self._kept(entry, filtered))
             yield self._source(entry, file, station, kept, filtered, noticed, removed)
 
     def _on_tiles(self, entry: Entry, file: Path, digest: str) -> Iterator[Source]:
@@ -179,8 +179,18 @@ class Loader:
             self.progress.stage(f"{file.stem}: reading what is left")
             with self.clock.measure("read"):
                 chunks = (self._placed(entry, chunk) for chunk in raw)
-                kept, removed = spooled(chunks, known, self.scratch / f"kept-{key[:16]}")
+                kept, removed = spooled(
+                    chunks,
+                    known,
+                    self.scratch / f"kept-{key[:16]}",
+                    lambda part: self._kept(entry, part),
+                )
             yield self._source(entry, file, station, kept, known, known.noticed, removed)
+
+    def _kept(self, entry: Entry, filtered: Filtered) -> Cloud:
+        """Return the kept points, with what they were taken for where that is wanted."""
+        steps = steps_of(entry.kind, self.recipe)
+        return with_clutter(filtered) if any(marks_clutter(s) for s in steps) else filtered.cloud
 
     def _tiles_key(self, entry: Entry, digest: str, station: int) -> str:
         """Return the name of the tiles: a hash of what they depend on, not of later filters."""

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong.cloud import Cloud
+from dougong.filters.clutter import Clutter
 from dougong.filters.selection import CLUTTER, CLUTTER_MARGIN, NOISE, Reason
-from dougong.pipeline.steps import GROUND, Filtered
+from dougong.pipeline.steps import GROUND, Filtered, Step
 from dougong.typing import Mask
 
 GROUND_CLASS, NOISE_CLASS = 2, 7
@@ -51,6 +52,11 @@ def marked(
     for name, values in (details or {}).items():
         result = result.with_attribute(name, values)
     return result
+
+
+def marks_clutter(step: Step) -> bool:
+    """Say whether a filter marks clutter on the points that stay."""
+    return isinstance(step.params, Clutter) and step.params.action == "mark"
 
 
 def with_clutter(filtered: Filtered) -> Cloud:

@@ -79,6 +79,9 @@ def stage_documents(mover: Mover) -> list[dict[str, Any]]:
             row["points_in"] += stage.points_in
             row["points_out"] += stage.points_out
             row["seconds"] += stage.seconds
+            for name, count in stage.found.items():
+                found = row.setdefault("found", {})
+                found[name] = found.get(name, 0) + count
     for row in rows.values():
         row["reduction"] = 1.0 - row["points_out"] / row["points_in"] if row["points_in"] else 0.0
     return list(rows.values())

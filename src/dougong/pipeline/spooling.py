@@ -1,20 +1,25 @@
 """A cloud that was filtered on tiles, decoded once more: what was kept goes to disk."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-
-import numpy as np
 
 from dougong.cloud import Cloud
 from dougong.errors import InputError
-from dougong.filters.selection import Reason
 from dougong.pipeline.kept import Kept, KeptFile, together
 from dougong.pipeline.removed import removed_sample, shortened
+from dougong.pipeline.steps import Filtered
 from dougong.pipeline.store import Books
 
 
-def spooled(chunks: Iterable[Cloud], books: Books, folder: Path) -> tuple[Kept, Cloud]:
+def spooled(
+    chunks: Iterable[Cloud],
+    books: Books,
+    folder: Path,
+    kept: Callable[[Filtered], Cloud] = lambda part: part.cloud,
+) -> tuple[Kept, Cloud]:
     """Write the kept points to `folder`; return them, and the sample of the removed ones.
+
+    `kept` makes what is written of each filtered chunk.
 
     Raises
     ------
@@ -32,7 +37,7 @@ def spooled(chunks: Iterable[Cloud], books: Books, folder: Path) -> tuple[Kept, 
         codes = books.codes[here]
         if len(codes) < len(chunk):
             break
-        file.add(chunk.select(np.flatnonzero(codes == Reason.KEPT)))
+        file.add(kept(books.part(chunk, here)))
         details = {name: values[here] for name, values in books.details.items()}
         more = removed_sample(chunk, codes, details=details)
         removed = more if removed is None else shortened(together([removed, more]))
