@@ -6,16 +6,19 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from dougong.cloud import Cloud
-from dougong.errors import TileError
+from dougong.errors import OutputError, TileError
 from dougong.filters import FILTERS
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
+from dougong.filters.radius import Radius
 from dougong.filters.selection import Reason, details_of
+from dougong.tiles import work
 from dougong.tiles.cloud import load_tiles, read_arrays
-from dougong.tiles.engine import local_engine
+from dougong.tiles.engine import Task, local_engine
 from dougong.tiles.folder import LocalFolder
 from dougong.tiles.partition import partition
 from dougong.tiles.spool import Spool
 from dougong.tiles.stages import TileBench
+from dougong.tiles.work import Job
 
 JOBS = [
     ("low_outliers", {}),
@@ -146,9 +149,6 @@ def test_finished_tiles_are_not_done_again(tmp_path, monkeypatch):
 
 def test_a_failing_tile_is_tried_again_then_named_and_the_rest_completes(tmp_path, monkeypatch):
     cloud, _ = tiled(site(2), tmp_path, 1500)
-    from dougong.filters.radius import Radius
-    from dougong.tiles import work
-
     bad, tries, judge = cloud.tiles[1].name, [], work.judge_radius
 
     def failing(job):
@@ -166,3 +166,27 @@ def test_a_failing_tile_is_tried_again_then_named_and_the_rest_completes(tmp_pat
     assert finished == len(cloud.tiles) - 1
     with local_engine() as engine:
         assert TileBench(cloud, engine).apply("radius", Radius()).asked == cloud.points
+
+
+def test_who_does_not_see_the_tiles_is_told_where_to_put_them(tmp_path):
+    cloud, _ = tiled(site(2), tmp_path, 1500)
+    for path in tmp_path.glob("*.npz"):
+        path.rename(path.with_suffix(".gone"))  # as on a machine that has no such folder
+    job = Job(cloud.folder, cloud.tiles[0], "", Radius())
+    task = Task(cloud.tiles[0].name, cloud.folder, "done.npz", work.judge_radius, job)
+    with local_engine() as engine, pytest.raises(TileError, match=r"Every worker must see .*s3://"):
+        engine.run([task])
+
+
+def test_no_more_tiles_are_begun_once_the_disk_is_full(tmp_path, monkeypatch):
+    cloud, _ = tiled(site(2), tmp_path, 1500)
+    tries = []
+
+    def full(job):
+        tries.append(job.tile)
+        raise OutputError("The disk is full.")
+
+    monkeypatch.setattr(work, "judge_radius", full)
+    with local_engine() as engine, pytest.raises(OutputError, match="full"):
+        TileBench(cloud, engine).apply("radius", Radius())
+    assert len(tries) == 1
