@@ -182,3 +182,23 @@ def test_a_killed_run_goes_on_from_shared_storage(scan, tmp_path, little_room, b
         assert subprocess.run(command, check=False).returncode == code
     found, _ = filtered_by(scan, tmp_path / "out.laz", "--kind", "lidar", "--overwrite")
     np.testing.assert_array_equal(found.records, whole.records)
+
+
+def test_a_command_whose_files_are_on_a_disk_says_so(tmp_path, capsys):
+    for command in (["view", "scan.laz"], ["bench", "--out", str(tmp_path / "bench")]):
+        assert call([*command, "--work", "s3://bucket/work"]) == 2
+        said = capsys.readouterr().err
+        assert said == (
+            "error: --work of this command is a folder on a disk, got 's3://bucket/work'. "
+            "Name a folder.\n"
+        )
+
+
+def test_without_room_for_copies_files_are_fetched_again(bucket, tmp_path, monkeypatch):
+    monkeypatch.setattr("dougong.tiles.shared._LEAST_FREE", 2.0)
+    folder = folder_of(bucket[0])
+    with copies_in(tmp_path / "copies"):
+        write_arrays(folder, "a.npz", {"values": np.arange(9)}, {"taken": 3})
+        assert read_record(folder, "a.npz") == {"taken": 3}
+        np.testing.assert_array_equal(read_file(folder, "a.npz")["values"], np.arange(9))
+        assert not list((tmp_path / "copies").rglob("*.npz"))

@@ -186,9 +186,13 @@ def _places(output: Path, work: Folder | None, facts: str) -> Iterator[tuple[Fol
 
     The tiles' is in `work`, named by what they depend on; what is beside the output goes again.
     """
-    beside = LocalFolder(output.with_name(f"tiles-{output.name}-{os.getpid()}"))
     told = f"{dougong.__version__} {facts}"
-    name = f"tiles-{hashlib.sha256(told.encode()).hexdigest()[:16]}"
+    key = hashlib.sha256(told.encode()).hexdigest()[:16]
+    name = f"tiles-{key}"
+    # Where a killed run left something, the one that goes on with its tiles finds it and tidies up.
+    beside = LocalFolder(
+        output.with_name(f"tiles-{output.name}-{os.getpid() if work is None else key}")
+    )
     folder = beside if work is None else work / name
     try:
         with copies_in(beside.path / "copies"):

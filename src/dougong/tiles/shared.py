@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from dougong.errors import InputError, OutputError
+from dougong.formats.atomic import part_of
 from dougong.tiles.folder import Fill, Folder, LocalFolder
 
 _END_BYTES = 1 << 16
@@ -42,40 +43,14 @@ def keep_copies(folder: Path | None) -> None:
 @contextmanager
 def copies_in(folder: Path) -> Iterator[None]:
     """Have this process keep copies until the block ends, then delete them."""
+    # Those of a killed run may be of what is no longer there.
+    shutil.rmtree(folder, ignore_errors=True)
     keep_copies(folder)
     try:
         yield
     finally:
         keep_copies(None)
         shutil.rmtree(folder, ignore_errors=True)
-
-
-@dataclass(frozen=True, slots=True)
-class _Copies:
-    """Copies of the files of a shared folder; None: there are none."""
-
-    folder: Path | None
-
-    def open(self, name: str) -> IO[bytes]:
-        """Open a copy to read."""
-        if self.folder is None:
-            raise FileNotFoundError(name)
-        return (self.folder / name).open("rb")
-
-    def keep(self, name: str, content: bytes) -> None:
-        """Make a copy, unless the disk gets full: the file itself is elsewhere."""
-        if self.folder is None:
-            return
-        with suppress(OutputError):
-            LocalFolder(self.folder).write(name, lambda file: file.write(content))
-            disk = shutil.disk_usage(self.folder)
-            if disk.free < _LEAST_FREE * disk.total:
-                self.remove()
-
-    def remove(self) -> None:
-        """Delete the copies."""
-        if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,19 +84,26 @@ class SharedFolder:
 
     def open(self, name: str) -> IO[bytes]:
         """Open the copy of a file, or fetch it: one request."""
-        copies = self._copies(name)
-        with suppress(FileNotFoundError):
-            return copies.open(name)
+        copy = self._copy_of(name)
+        if copy is not None and copy.exists():
+            return copy.open("rb")
         with self._told("read"):
             system, path = self._system()
-            content = system.cat_file(f"{path}/{name}")
-        copies.keep(name, content)
-        return io.BytesIO(content)
+            if copy is None or not _has_room(copy.parent):
+                return io.BytesIO(system.cat_file(f"{path}/{name}"))
+            part = part_of(copy)
+            try:
+                system.get_file(f"{path}/{name}", str(part))
+                part.replace(copy)
+            finally:
+                part.unlink(missing_ok=True)
+        return copy.open("rb")
 
     def open_end(self, name: str) -> IO[bytes]:
         """Open the copy of a file, or fetch its end."""
-        with suppress(FileNotFoundError):
-            return self._copies(name).open(name)
+        copy = self._copy_of(name)
+        if copy is not None and copy.exists():
+            return copy.open("rb")
         with self._told("read"):
             system, path = self._system()
             size = system.size(f"{path}/{name}")
@@ -137,17 +119,28 @@ class SharedFolder:
             return stamp
 
     def write(self, name: str, fill: Fill) -> None:
-        """Send a file whole."""
-        buffer = io.BytesIO()
-        fill(buffer)
-        with self._told("written"):
-            system, path = self._system()
-            system.pipe_file(f"{path}/{name}", buffer.getvalue())
-        self._copies(name).keep(name, buffer.getvalue())
+        """Send a file whole; its copy, where one is made, is sent piece by piece."""
+        copy = self._copy_of(name)
+        if copy is None or not _has_room(copy.parent):
+            buffer = io.BytesIO()
+            fill(buffer)
+            with self._told("written"):
+                system, path = self._system()
+                system.pipe_file(f"{path}/{name}", buffer.getvalue())
+            return
+        LocalFolder(copy.parent).write(name, fill)
+        try:
+            with self._told("written"):
+                system, path = self._system()
+                system.put_file(str(copy), f"{path}/{name}")
+        except BaseException:
+            copy.unlink(missing_ok=True)
+            raise
 
     def remove(self) -> None:
         """Delete all objects under the prefix."""
-        self._copies(".npz").remove()
+        if _copies is not None:
+            shutil.rmtree(self._copies(_copies), ignore_errors=True)
         with self._told("cleared"), suppress(FileNotFoundError):
             system, path = self._system()
             system.rm(path, recursive=True)
@@ -168,17 +161,22 @@ class SharedFolder:
             system, path = self._system()
             system.rm_file(f"{path}/{probe}")
 
-    def _copies(self, name: str) -> "_Copies":
-        """Return where copies are, of files that never change once they are there."""
-        kept = _copies if name.endswith(".npz") else None
-        return _Copies(kept and kept / hashlib.sha256(self.url.encode()).hexdigest()[:16])
+    def _copy_of(self, name: str) -> Path | None:
+        """Return where the copy of a file goes, if it never changes and copies are kept."""
+        if _copies is None or not name.endswith(".npz"):
+            return None
+        return self._copies(_copies) / name
+
+    def _copies(self, folder: Path) -> Path:
+        return folder / hashlib.sha256(self.url.encode()).hexdigest()[:16]
 
     def _system(self) -> tuple[Any, str]:
         """Return who reaches the storage, and the prefix as it names it."""
         from fsspec.core import url_to_fs
 
-        # Others write there too, so no listing is remembered.
-        found: tuple[Any, str] = url_to_fs(self.url, use_listings_cache=False)
+        # Others write there too, so no listing is remembered. Large files go in pieces, of which
+        # one at a time is in memory.
+        found: tuple[Any, str] = url_to_fs(self.url, use_listings_cache=False, max_concurrency=1)
         return found
 
     @contextmanager
@@ -195,6 +193,13 @@ class SharedFolder:
             # A worker elsewhere has an environment of its own.
             msg = f"{self.url} could not be {done} from {socket.gethostname()}: {reason}. {_CHECK}"
             raise OutputError(msg) from error
+
+
+def _has_room(folder: Path) -> bool:
+    """Make a folder for copies and say whether its disk has room for some."""
+    folder.mkdir(parents=True, exist_ok=True)
+    disk = shutil.disk_usage(folder)
+    return disk.free > _LEAST_FREE * disk.total
 
 
 def folder_of(place: str | Path) -> Folder:
