@@ -2,20 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dougong.evaluation.clutter_site import ClutterSite, clutter_site
+from dougong.evaluation.clutter_site import clutter_site
 from dougong.evaluation.clutter_things import PERSON, POLE, THINGS, VEHICLE, WIRE
-from dougong.evaluation.mesh import CLUSTER, FINE, MIXED, NEAR_NOISE, OUTLIER, SURFACE, VEGETATION
+from dougong.evaluation.mesh import (
+    CLUSTER,
+    FINE,
+    MIXED,
+    NEAR_NOISE,
+    OUTLIER,
+    SURFACE,
+    VEGETATION,
+    load_mesh,
+)
+from dougong.evaluation.scenes import scan_mesh
 from dougong.filters.cloth_simulation import GROUND, ClothSimulation, cloth_simulation
 from dougong.filters.clutter import Clutter, clutter
 from dougong.filters.clutter_kinds import ClutterKind
 from dougong.filters.curvature_weighted import curvature_weighted
 from dougong.filters.low_outliers import low_outliers
+from dougong.formats import read
+from dougong.typing import Index, Points, Values
 
+MESHES = {
+    "nuyda_house/nuyda.ply": False,
+    "monastery_mesh/samurai_monastry.obj.gz": True,
+}
+"""Under the data folder, and whether y is up; those that are missing are left out."""
+CLOUDS = (
+    "lion_takanawa/lion_takanawa.copc.laz",
+    "espacio_escultorico/espacio_escultorico_uav_lod3.laz",
+    "street_pair/source.ply",
+    "street_pair/target.ply",
+)
 LEAST_POINTS = 50
 """Things that fewer points were left of are not counted."""
 TRUE_KIND = {
@@ -41,7 +65,7 @@ def trial(
         (``points_on``, and under each kind how many were taken for it).
     """
     site = clutter_site(kind, seed, points)
-    left, height = _off_ground(site)
+    left, height = _off_ground(site.points)
     found = clutter(site.points[left], params, height_above_ground=height)
     kinds = found.attributes["clutter_kind"]
     labels, things = site.labels[left], site.things[left]
@@ -70,14 +94,43 @@ def trial(
     return rows
 
 
-def _off_ground(site: ClutterSite) -> tuple[Any, Any]:
+def _off_ground(points: Points) -> tuple[Index, Values]:
     """Return the points that the recipe leaves off the ground, and their heights."""
-    left = np.flatnonzero(low_outliers(site.points).is_kept)
-    cloth = cloth_simulation(site.points[left], ClothSimulation(class_threshold_m=0.09))
+    left = np.flatnonzero(low_outliers(points).is_kept)
+    cloth = cloth_simulation(points[left], ClothSimulation(class_threshold_m=0.09))
     is_off = cloth.attributes["ground_class"] != GROUND
     left, height = left[is_off], cloth.attributes["height_above_ground"][is_off]
-    is_kept = curvature_weighted(site.points[left]).is_kept
+    is_kept = curvature_weighted(points[left]).is_kept
     return left[is_kept], height[is_kept]
+
+
+def real_offers(folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield, for each of `MESHES` (scanned) and `CLOUDS` in a folder, what is offered: clusters.
+
+    Nobody labelled them: look at what is found. Wires are counted in points.
+    """
+    for name, is_y_up in MESHES.items():
+        if (folder / name).is_file():
+            vertices, faces = load_mesh(folder / name, is_y_up=is_y_up)
+            scene = scan_mesh(
+                vertices, faces, seed=1, lidar_points=800_000, photogrammetry_points=20_000
+            )
+            yield _offers(f"{Path(name).parent}, scanned", scene.lidar.xyz)
+    for name in CLOUDS:
+        if (folder / name).is_file():
+            yield _offers(str(Path(name).parent), read(folder / name).xyz)
+
+
+def _offers(name: str, points: Points) -> dict[str, Any]:
+    left, height = _off_ground(points)
+    found = clutter(points[left], height_above_ground=height).found
+    kinds = {kind: found.get(f"{kind}_clusters", 0) for kind in ("person", "vehicle", "pole")}
+    return {
+        "cloud": name,
+        "off the ground": len(left),
+        **kinds,
+        "wire points": found.get("wire_points", 0),
+    }
 
 
 def thing_table(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -122,9 +175,11 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         table.append(
             {
                 "kind": name,
-                "n": there.get(name, 0),
-                "recall %": _share(of_it.get(name, 0), there.get(name, 0)),
-                "precision %": _share(of_it.get(name, 0), sum(of_it.values())),
+                "n": there.get(name),
+                "recall %": _share(of_it[name], there[name]) if name in there else None,
+                "precision %": (
+                    _share(of_it[name], sum(of_it.values())) if name in there else None
+                ),
                 "points": all_on,
                 "point recall %": _share(on_it[name], all_on),
                 "point precision %": _share(on_it[name], sum(on_it.values())),

@@ -39,6 +39,9 @@ POLE_FOOT = 1.5
 PERSON_PITCH_M, VEHICLE_PITCH_M = 0.13, 0.20
 """Points farther apart than this show no shape: bushes and rocks have such sizes too."""
 
+POLE_LAYER = 5.0
+"""Points that a layer of a pole holds on average: by fewer no one can tell how thick it is."""
+
 
 class ClutterKind(IntEnum):
     """What a point was taken for: attribute ``clutter_kind``, written as ``dougong_clutter``."""
@@ -113,4 +116,5 @@ def _pole(s: Shape, p: Clutter) -> float:
         at_most(s.girth_m, p.pole_radius_m),
         at_most(s.foot_m, POLE_FOOT * p.pole_radius_m),
         at_least(s.top_m, 2.0 * SLENDER * s.girth_m),
+        at_least(s.per_layer, POLE_LAYER),
     )

@@ -46,6 +46,8 @@ class Shape(NamedTuple):
     thinner than: the radius of a shaft, about, whether it is seen from all sides or from one."""
     pitch_m: float
     """Side of the square of its longest face that each point stands for."""
+    per_layer: float
+    """Points per layer, on average."""
     filled: float
     """Share of the layers from low to top that hold points."""
 
@@ -79,6 +81,7 @@ def shape_of(points: Points, height: Values) -> Shape:
         median_m=float(np.nanmedian(spread)),
         girth_m=float(np.median(girth)),
         pitch_m=float(np.sqrt(length * (top - low) / len(points))),
+        per_layer=len(points) / len(layers),
         filled=float(np.isfinite(spread).mean()),
     )
 
