@@ -4,11 +4,13 @@ import base64
 import http.client
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import zlib
 from dataclasses import replace
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -17,7 +19,9 @@ import pytest
 import dougong.report.render as rendering
 from dougong.cloud import Cloud
 from dougong.errors import InputError
+from dougong.filters.selection import Reason
 from dougong.formats import write
+from dougong.pipeline.marking import CLUTTER_CLASS, GROUND_CLASS, NOISE_CLASS
 from dougong.pipeline.pairs import read_pairs
 from dougong.report.figures import find_place
 from dougong.report.layers import BLUE, COLOURS, Cores, Layer, Removed
@@ -387,3 +391,18 @@ def test_measured_distances_are_shown_signed(layers):
     assert scene["residual"]["is_signed"]
     assert scene["residual"]["shown_m"] == pytest.approx(0.02)
     assert not view_3d(layers, find_place(layers)).scene["residual"]["is_signed"]
+
+
+def test_the_viewer_has_a_colour_for_every_reason_and_class_of_ours():
+    source = Path(__file__).parent.parent / "viewer" / "src" / "colours.js"
+    if not source.is_file():
+        pytest.skip("the viewer's sources are not part of an installed package")
+    classes, reasons = source.read_text(encoding="utf-8").split("export const REASONS")
+    codes = [
+        [int(code) for code in re.findall(r"\[(\d+), \"", part)] for part in (classes, reasons)
+    ]
+    assert {GROUND_CLASS, NOISE_CLASS, CLUTTER_CLASS} <= set(codes[0])
+    assert codes[1] == [int(reason) for reason in Reason]
+    # A byte holds both: sixteen places each, the last class for all that have none.
+    assert len(codes[0]) < 16
+    assert len(codes[1]) <= 16

@@ -6,7 +6,7 @@ export const RESIDUAL = ["#0d0887", "#6a00a8", "#b12a90", "#e16462", "#fca636", 
 export const SIGNED = ["#08306b", "#2f80bd", "#b3cbd9", "#dcc3ad", "#cf6237", "#7a1a08"];
 export const NONE = "#8c8c8c";
 
-// ASPRS classes 0..18: noise stands out, the rest stays quiet.
+// ASPRS classes, and the one of our clutter filter: what may have to go stands out, the rest is quiet.
 const UNKNOWN = "#9a9a96";
 export const CLASSES = [
   [0, "never classified", UNKNOWN],
@@ -18,14 +18,18 @@ export const CLASSES = [
   [6, "building", "#7aa6cf"],
   [7, "noise", "#cc2f7b"],
   [9, "water", "#2266cc"],
+  [64, "clutter: a person, vehicle, pole or wire", "#e69f00"],
 ];
-export const CLASS_COUNT = 20;
+// Classes are drawn by their place in the list; the last place is for all that are not in it.
+export const CLASS_COUNT = 16;
+const OTHER = CLASS_COUNT - 1;
 
-export function classColours() {
-  const colours = Array.from({ length: CLASS_COUNT }, () => UNKNOWN);
-  for (const [code, , colour] of CLASSES) colours[code] = colour;
-  return colours;
-}
+const SLOTS = new Uint8Array(256).fill(OTHER);
+CLASSES.forEach(([code], slot) => (SLOTS[code] = slot));
+export const classSlot = (code) => SLOTS[code];
+
+export const classColours = () =>
+  Array.from({ length: CLASS_COUNT }, (_, slot) => CLASSES[slot]?.[2] ?? UNKNOWN);
 
 // Why a point was taken out (dougong_reason); Okabe and Ito (2008) on the quiet grey of what stayed.
 export const REASONS = [
@@ -37,8 +41,11 @@ export const REASONS = [
   [5, "radius", "#009e73"],
   [6, "cropped", "#56b4e9"],
   [7, "cloth", "#e6c200"],
+  [8, "clutter", "#7b3294"],
 ];
+export const REASON_COUNT = 16;
 
-export const reasonColours = () => REASONS.map(([, , colour]) => colour);
+export const reasonColours = () =>
+  Array.from({ length: REASON_COUNT }, (_, code) => REASONS[code]?.[2] ?? UNKNOWN);
 
 export const hex = (rgb) => "#" + rgb.map((v) => v.toString(16).padStart(2, "0")).join("");

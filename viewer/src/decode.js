@@ -1,5 +1,7 @@
 // The points that a report carries: base64 of a zlib stream of byte planes (see report/payload.py).
 
+import { CLASS_COUNT, REASON_COUNT, classSlot } from "./colours.js";
+
 async function inflated(element) {
   const text = element.textContent;
   const bytes = Uint8Array.fromBase64
@@ -11,7 +13,7 @@ async function inflated(element) {
 }
 
 // Class and reason of removal in one byte, as the shader takes them apart.
-export const packed = (code, reason) => Math.min(code, 31) + 32 * Math.min(reason, 7);
+export const packed = (code, reason) => classSlot(code) + CLASS_COUNT * Math.min(reason, REASON_COUNT - 1);
 
 // A signed distance (metres) as a byte: 127 is zero, 255 none.
 export function residualCode(metres, most) {

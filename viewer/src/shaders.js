@@ -1,9 +1,9 @@
-import { CLASS_COUNT } from "./colours.js";
+import { CLASS_COUNT, REASON_COUNT } from "./colours.js";
 
 export const MAX_SOURCES = 16;
 export const ALONE = 255; // in place of a size: no other point near
 
-// info: source; residual code (255: no other cloud near, 127: zero); class + 32 x reason of removal;
+// info: source; residual code (255: no other cloud near, 127: zero); class's slot + 16 x reason of removal;
 // size in quarter octaves above `spacing`, or ALONE.
 export const POINT_VERTEX = `
 in vec3 colour;
@@ -13,7 +13,7 @@ uniform vec4 source[${MAX_SOURCES}];   // rgb, shown
 uniform vec3 heightRamp[6];
 uniform vec3 residualRamp[6];
 uniform vec3 classes[${CLASS_COUNT}];
-uniform vec3 reasons[8];
+uniform vec3 reasons[${REASON_COUNT}];
 uniform vec4 slab;                     // unit normal, position along it
 uniform float slabHalf;                // half its thickness, metres; negative: no slice
 uniform vec4 box[3];                   // unit axes of the cut box, middle along each
@@ -43,7 +43,7 @@ bool isOut(vec3 world) {
 void main() {
   int own = int(info.x + 0.5);
   int packed = int(info.z + 0.5);
-  int reason = packed / 32;
+  int reason = packed / ${CLASS_COUNT};
   vec4 world = motion[own] * vec4(position, 1.0);
   if (isOut(world.xyz) || source[own].a < 0.5 || (reason > 0 && showRemoved < 0.5)) {
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
@@ -58,7 +58,7 @@ void main() {
     float value = sign(root) * root * root * RESIDUAL_CODE_MAX / residualMax;
     float share = isSigned > 0.5 ? 0.5 + 0.5 * value : abs(value);
     tint = info.y > 254.5 ? vec3(0.55) : along(residualRamp, share);
-  } else if (mode == 4) tint = classes[min(packed - 32 * reason, ${CLASS_COUNT - 1})];
+  } else if (mode == 4) tint = classes[packed - ${CLASS_COUNT} * reason];
   else tint = reasons[reason];
   gl_Position = projectionMatrix * viewMatrix * world;
   float perMetre = isOrtho > 0.5 ? pixelsPerMetre : pixelsPerMetre / gl_Position.w;

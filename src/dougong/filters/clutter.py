@@ -35,8 +35,8 @@ class Clutter(Parameters):
     """Which clusters are offered as clutter, and whether they are taken out."""
 
     action: Literal["off", "mark", "remove"] = "mark"
-    """mark: every point stays and says what it was taken for. remove: the offered points go. off:
-    nothing is looked for."""
+    """mark: every point stays and says what it was taken for. remove: the offered points go.
+    off (in the recipes, unless set): nothing is looked for."""
     kinds: tuple[Name, ...] = ("person", "vehicle", "pole", "wire")
     """What is offered."""
     min_margin: Annotated[float, Field(ge=0, lt=1)] = 0.0
