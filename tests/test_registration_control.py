@@ -403,9 +403,9 @@ def test_the_part_of_the_covariance_that_control_points_bring_is_known():
 def test_few_blocks_say_nothing_of_what_control_points_fix():
     covariance = np.diag([2e-4**2] * 3 + [0.003**2] * 3)
     surface = np.random.default_rng(0).uniform(-20, 20, (300, 3))
-    known = displacement95(covariance, np.zeros(3), surface, 14, covariance)
-    normal = displacement95(covariance, np.zeros(3), surface, 1_000_000)
+    known = displacement95(covariance, np.zeros(3), surface, 14, 1.5, covariance)
+    normal = displacement95(covariance, np.zeros(3), surface, 1_000_000, 1.0)
     assert known == pytest.approx(normal, rel=0.05)
     # Half from each: between the two, by their variances.
-    both = displacement95(2 * covariance, np.zeros(3), surface, 1_000_000, covariance)
+    both = displacement95(2 * covariance, np.zeros(3), surface, 1_000_000, 1.0, covariance)
     assert both == pytest.approx(2**0.5 * normal, rel=0.05)

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from dougong.errors import RegistrationError
 from dougong.registration import covariance, icp_solve, overlap
@@ -238,21 +239,36 @@ def test_expected_displacement_follows_the_covariance():
     many = 10_000
     slides = np.zeros((6, 6))
     slides[3, 3] = 0.01**2
-    found = covariance.displacement95(slides, np.zeros(3), points, many)
+    found = covariance.displacement95(slides, np.zeros(3), points, many, 1.0)
     assert found == pytest.approx(0.0196, rel=0.05)
     turns = np.zeros((6, 6))
     turns[2, 2] = 0.001**2
     # One milliradian about z moves a point 10 m away by 10 mm.
-    found = covariance.displacement95(turns, np.zeros(3), points[1:], many)
+    found = covariance.displacement95(turns, np.zeros(3), points[1:], many, 1.0)
     assert found == pytest.approx(0.0196, rel=0.05)
     # In three directions the length is a chi of three: 2.80 sigma, not 1.96.
     every = np.diag([0.0, 0.0, 0.0, 1e-4, 1e-4, 1e-4])
-    found = covariance.displacement95(every, np.zeros(3), points, many)
+    found = covariance.displacement95(every, np.zeros(3), points, many, 1.0)
     assert found == pytest.approx(0.0280, rel=0.05)
+
+
+def test_few_or_unequal_blocks_widen_the_covariance_to_hotellings():
+    rng = np.random.default_rng(0)
+    for unknowns, blocks in ((6, 15), (6, 60), (7, 30)):
+        drawn = rng.normal(size=(3000, blocks, unknowns))
+        centred = drawn - drawn.mean(axis=1, keepdims=True)
+        known = np.einsum("rbi,rbj->rij", centred, centred) / (blocks - 1)
+        miss = rng.normal(size=(3000, unknowns))
+        square = np.einsum("ri,ri->r", miss, np.linalg.solve(known, miss[:, :, None])[:, :, 0])
+        widening = covariance.widening_of(np.full(blocks, unknowns / blocks))
+        covered = (square / widening <= chi2.ppf(0.95, unknowns)).mean()
+        assert covered == pytest.approx(0.95, abs=0.015)
+    equal, slivers = np.full(20, 0.3), np.concatenate([np.full(20, 0.29), np.full(20, 0.01)])
+    assert covariance.widening_of(slivers) == pytest.approx(covariance.widening_of(equal), rel=0.15)
 
 
 def test_few_blocks_widen_the_expected_displacement_by_students_t():
     slides = np.zeros((6, 6))
-    slides[3, 3] = 0.01**2 * (16 - 1) / (16 - 8)
-    found = covariance.displacement95(slides, np.zeros(3), np.zeros((1, 3)), 16)
+    slides[3, 3] = 0.01**2 * 1.7
+    found = covariance.displacement95(slides, np.zeros(3), np.zeros((1, 3)), 16, 1.7)
     assert found == pytest.approx(0.0213, rel=0.06)

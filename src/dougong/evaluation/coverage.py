@@ -71,7 +71,9 @@ def coverage(
     squares = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        one, two = (_cloud(rng, points, white_m, field_m, length_m) for _ in range(2))
+        # Anywhere: a wall along the sides of the blocks would flatter or spoil them.
+        at = Rotation.from_euler("z", rng.uniform(0, 360), degrees=True), rng.uniform(-20, 20, 3)
+        one, two = (_cloud(rng, points, white_m, field_m, length_m, at) for _ in range(2))
         if dof == 7:
             fit = fit_similarity(one, two, np.eye(4), "source", icp, 7)
             assert fit is not None
@@ -99,9 +101,15 @@ def _square(T: Transform, covariance: NDArray[np.float64], centre: NDArray[np.fl
 
 
 def _cloud(
-    rng: np.random.Generator, count: int, white_m: float, field_m: float, length_m: float
+    rng: np.random.Generator,
+    count: int,
+    white_m: float,
+    field_m: float,
+    length_m: float,
+    at: tuple[Rotation, NDArray[np.float64]],
 ) -> Prepared:
     xyz, normals = _hall(rng, count)
+    xyz, normals = at[0].apply(xyz) + at[1], at[0].apply(normals)
     off = field_m * _field(rng, xyz, length_m) + rng.normal(0.0, white_m, count)
     moved = xyz + off[:, None] * normals
     area = _area() / count

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,16 @@ def blocks_of(points: Points, size_m: float) -> tuple[Index, int]:
     return block.reshape(-1).astype(np.int64), len(keys)
 
 
+class Jackknife(NamedTuple):
+    """What leaving out blocks of the surface says about a fit's unknowns."""
+
+    covariance: NDArray[np.float64] | None
+    """(k, k), widened; None: too few blocks."""
+    blocks: int
+    widening: float
+    """What the covariance was multiplied with for being known from so few blocks only."""
+
+
 def jackknife(
     pairs: Pairs,
     weights: Values,
@@ -42,11 +52,8 @@ def jackknife(
     dof: int,
     length_m: float,
     block_m: float,
-) -> tuple[NDArray[np.float64] | None, int]:
-    """Return the (6, 6) covariance of (omega, v) about `centre`, and its number of blocks.
-
-    See `leave_blocks_out`.
-    """
+) -> Jackknife:
+    """Return the (6, 6) covariance of (omega, v) about `centre`, see `leave_blocks_out`."""
     arms = pairs.points - centre
 
     def equations(block: Index, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -64,10 +71,10 @@ def leave_blocks_out(
     solved: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
     unit: NDArray[np.float64],
     block_m: float,
-) -> tuple[NDArray[np.float64] | None, int]:
-    """Return the covariance (k, k) of a fit's k unknowns, and the number of blocks behind it.
+) -> Jackknife:
+    """Return the covariance of a fit's k unknowns from what blocks of the surface say.
 
-    Blocks of the surface are left out one by one.
+    Blocks are left out one by one.
 
     Parameters
     ----------
@@ -89,11 +96,10 @@ def leave_blocks_out(
     hold points, and the largest answer counts, since bending is slower than any one block; for
     small objects the block shrinks instead. What blocks of an edge h miss of errors that reach over
     their sides falls as 1 / h: where twice the edge shows more, V(2h) is raised to
-    2 V(2h) - V(h), at most twice. Widened by (b - 1) / (b - 8), so that the expected
-    squared error in units of the covariance is right for b blocks. None, 0: too few blocks.
+    2 V(2h) - V(h), at most twice. Widened by `widening_of`, for a covariance that so few blocks
+    tell is itself uncertain.
     """
-    best: NDArray[np.float64] | None = None
-    blocks, best_size = 0, 0.0
+    best, best_size = Jackknife(None, 0, 1.0), 0.0
     halves: dict[float, float] = {}
     for growth in _growths(points, block_m):
         block, count = blocks_of(points, block_m * growth)
@@ -104,10 +110,45 @@ def leave_blocks_out(
         covariance = (count - 1) / count * steps.T @ steps
         size = halves[growth] = float(np.trace(covariance * np.outer(unit, unit)))
         missing = 2.0 - min(1.0, halves.get(growth / 2.0, np.inf) / max(size, 1e-300))
-        factor = missing * (count - 1) / (count - 8)
-        if best is None or factor * size > best_size:
-            best, blocks, best_size = factor * covariance, count, factor * size
-    return best, blocks
+        widening = widening_of(_leverages(H, solved))
+        if best.covariance is None or missing * widening * size > best_size:
+            best_size = missing * widening * size
+            best = Jackknife(missing * widening * covariance, count, widening)
+    return best
+
+
+def _leverages(
+    H: NDArray[np.float64],
+    solved: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
+) -> Values:
+    """Return the share (b,) of the unknowns that each block decides; they add up to the unknowns.
+
+    H (b, k, k): the blocks' normal matrices.
+    """
+    H_all = H.sum(axis=0)
+    inverse = np.column_stack([-solved(H_all, unit) for unit in np.eye(len(H_all))])
+    shares: Values = np.maximum(np.einsum("ij,bji->b", inverse, H), 0.0)
+    return shares
+
+
+def widening_of(leverages: Values) -> float:
+    """Return what a covariance from blocks is multiplied with, so that its ellipsoid holds 95 %.
+
+    Squared errors in units of a covariance of p unknowns that is known from nu + 1 equal
+    observations follow Hotelling's T2, not chi2: the ratio of their 95 % quantiles. Blocks of
+    unequal weight count like fewer equal ones (Kish): (sum of the leverages)^2 over the sum of
+    their squares. A dozen blocks make the ellipsoid's axes half as long again; fewer than p + 2
+    say next to nothing.
+    """
+    from scipy.stats import chi2, f
+
+    total = float(leverages.sum())
+    unknowns = max(1, round(total))
+    equal = total**2 / max(float(leverages @ leverages), 1e-300)
+    freedom = max(equal - 1.0, unknowns + 1.0)
+    rest = freedom - unknowns + 1.0
+    hotelling = unknowns * freedom / rest * f.ppf(0.95, unknowns, rest)
+    return float(hotelling / chi2.ppf(0.95, unknowns))
 
 
 def _growths(points: Points, block_m: float) -> list[float]:
@@ -205,19 +246,20 @@ def displacement95(
     centre: NDArray[np.float64],
     points: Points,
     blocks: int,
+    widening: float,
     of_control: NDArray[np.float64] | None = None,
 ) -> float:
     """Return the TRE95 that 95 % of the poses stay below which the data allow, metres.
 
     What the blocks of surface say is drawn from the jackknife's own distribution, Student's t with
-    `blocks` - 1 degrees of freedom (`covariance` without its widening). `of_control` (6, 6), the
+    `blocks` - 1 degrees of freedom (`covariance` without its `widening`). `of_control` (6, 6), the
     part of `covariance` that comes from control points of known sigma, is drawn as normal and is
     not widened to begin with. TRE95 is the 95 % displacement of `points` (n, 3). The draws are the
     same for every call, so that the answer is a function of the data.
     """
     rng = np.random.default_rng(0)
     known = np.zeros((6, 6)) if of_control is None else of_control
-    draws = _drawn(rng, (covariance - known) * (blocks - 8) / (blocks - 1))
+    draws = _drawn(rng, (covariance - known) / widening)
     draws /= np.sqrt(rng.chisquare(blocks - 1, (_DRAWS, 1)) / (blocks - 1))
     if of_control is not None:
         draws += _drawn(rng, known)

@@ -226,6 +226,7 @@ def _judged(
         fine.covariance_about,
         apply(final.T, court.source.points[explained]),
         fine.covariance_blocks,
+        fine.covariance_widening,
         fine.covariance_of_control,
     )
     if status != "ok":

@@ -13,7 +13,7 @@ from pydantic import Field
 from dougong._checks import as_transform
 from dougong.errors import RegistrationError
 from dougong.params import Parameters
-from dougong.registration.covariance import blocks_of, jackknife, unobservable
+from dougong.registration.covariance import Jackknife, blocks_of, jackknife, unobservable
 from dougong.registration.icp_solve import (
     Robust,
     gravity_prior,
@@ -269,15 +269,16 @@ def _result(
     )
     is_enough = len(pairs.residuals) >= _LEAST_PAIRS
     centre = level.target.xyz.mean(axis=0)
-    covariance, blocks, rmse, fitness = None, 0, float("nan"), 0.0
+    found, rmse, fitness = Jackknife(None, 0, 1.0), float("nan"), 0.0
     loose: tuple[Mapping[str, Any], ...] = ()
     if is_enough:
         weights, scale = _weights(pairs, level, params)
         centre, length = centre_and_length(pairs, weights)
-        covariance, blocks = jackknife(pairs, weights, centre, params.dof, length, params.block_m)
-        if covariance is not None:
+        found = jackknife(pairs, weights, centre, params.dof, length, params.block_m)
+        if found.covariance is not None:
             distance = np.abs(_distance(pairs, params))
-            covariance *= robust_widening(distance, pairs.weights, scale, params.robust)
+            robust = robust_widening(distance, pairs.weights, scale, params.robust)
+            found = found._replace(covariance=robust * found.covariance)
         loose = unobservable(pairs, weights, centre, params.dof, length, params.block_m)
         is_inlier = weights > 0.0
         rmse = _rms(_distance(pairs, params)[is_inlier], pairs.weights[is_inlier])
@@ -292,9 +293,10 @@ def _result(
         max_distance_m=level.bound_m,
         overlap_source=overlap_share(level.source, level.target, T, level.bound_m),
         overlap_target=overlap_share(level.target, level.source, inverse(T), level.bound_m),
-        covariance=covariance,
+        covariance=found.covariance,
         covariance_about=centre,
-        covariance_blocks=blocks,
+        covariance_blocks=found.blocks,
+        covariance_widening=found.widening,
         unobservable=loose,
         history=tuple(history),
     )

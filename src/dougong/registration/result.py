@@ -56,6 +56,8 @@ class FineResult:
     """(6, 6), the part of `covariance` that the sigmas of control points bring; None: no points."""
     covariance_blocks: int = 0
     """Independent blocks of surface behind `covariance`; 0 where it is None."""
+    covariance_widening: float = 1.0
+    """What `covariance` holds for being known from so few blocks: `covariance.widening_of`."""
     unobservable: tuple[Mapping[str, Any], ...] = ()
     """Directions the data do not fix: {"vector": 6 numbers, "text": words}."""
     history: tuple[Mapping[str, float], ...] = ()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong.filters.neighbourhood import build_index
-from dougong.registration.covariance import blocks_of, leave_blocks_out
+from dougong.registration.covariance import Jackknife, blocks_of, leave_blocks_out
 from dougong.registration.icp import Icp, Level, build_levels, centre_and_length
 from dougong.registration.icp_solve import (
     gravity_prior,
@@ -212,24 +212,22 @@ def grown(
 def _result(
     fitted: _Fitted, T: Transform, factor: float, icp: Icp, free: Sequence[int]
 ) -> SimilarityFit:
-    covariance, blocks = _jackknife(fitted, free, icp.block_m)
+    found = _jackknife(fitted, free, icp.block_m)
     pairs = fitted.pairs
     widening = robust_widening(np.abs(pairs.residuals), pairs.weights, fitted.scale_m, icp.robust)
     return SimilarityFit(
         T_target_source=T,
         factor=factor,
-        covariance=None if covariance is None else widening * covariance,
-        blocks=blocks,
+        covariance=None if found.covariance is None else widening * found.covariance,
+        blocks=found.blocks,
         centre=fitted.centre,
         length_m=fitted.length,
         holds_scale=_holds_scale(fitted, free, icp.block_m),
     )
 
 
-def _jackknife(
-    fitted: _Fitted, free: Sequence[int], block_m: float
-) -> tuple[NDArray[np.float64] | None, int]:
-    """Return the (7, 7) covariance, and the number of blocks behind it."""
+def _jackknife(fitted: _Fitted, free: Sequence[int], block_m: float) -> Jackknife:
+    """Return the (7, 7) covariance."""
 
     def equations(block: Index, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         H, g = np.zeros((count, 7, 7)), np.zeros((count, 7))
