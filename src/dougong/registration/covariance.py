@@ -20,7 +20,6 @@ _FACING = 0.3
 # Share of the weight that must face a motion, and in how many blocks, for it to be held.
 _LEAST_FACING_SHARE = 0.004
 _LEAST_FACING_BLOCKS = 3
-_LOOSE_SIGMA_M = 0.05
 _DRAWS = 1000
 _DRAWN_POINTS = 400
 
@@ -194,19 +193,6 @@ def unobservable(
         if share < _LEAST_FACING_SHARE or int(held.sum()) < min(_LEAST_FACING_BLOCKS, count):
             found.append(_described(vector, length_m))
     return tuple(found)
-
-
-def loose_directions(
-    covariance: NDArray[np.float64] | None, length_m: float
-) -> tuple[Mapping[str, Any], ...]:
-    """Return the motions whose jackknife sigma, as motion at `length_m`, is above 5 cm."""
-    if covariance is None:
-        return ()
-    scale = np.array([length_m] * 3 + [1.0] * 3)
-    values, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
-    return tuple(
-        _described(vectors[:, k], length_m) for k in range(6) if values[k] > _LOOSE_SIGMA_M**2
-    )
 
 
 def _described(vector: NDArray[np.float64], length_m: float) -> Mapping[str, Any]:
