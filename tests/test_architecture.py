@@ -11,12 +11,14 @@ PACKAGE = Path(dougong.__file__).parent
 BASE = {"errors", "typing", "params", "_boxes", "_checks", "threads"}
 ALLOWED = {
     "kernels": set(),
+    "_sorting": BASE | {"kernels"},
     "cloud": BASE,
     "filters": BASE | {"cloud", "kernels"},
-    "formats": BASE | {"cloud", "kernels"},
+    "formats": BASE | {"_sorting", "cloud", "kernels"},
     "registration": BASE | {"cloud", "kernels", "filters"},
     "tiles": BASE | {"cloud", "kernels", "filters", "formats"},
-    "pipeline": BASE | {"cloud", "kernels", "filters", "formats", "registration", "tiles"},
+    "pipeline": BASE
+    | {"_sorting", "cloud", "kernels", "filters", "formats", "registration", "tiles"},
     "evaluation": BASE | {"cloud", "kernels", "filters", "formats", "registration", "pipeline"},
     "report": BASE | {"cloud", "formats", "filters", "registration", "pipeline"},
     "app": BASE

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._sorting import sorted_places
 from dougong.cloud import Records
 from dougong.formats.las_header import LasHeader
 from dougong.formats.las_write import Totals, as_bytes
@@ -128,7 +129,7 @@ def priorities(codes: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 def _sorted_places(records: Records, codes: NDArray[np.uint64]) -> NDArray[np.int64]:
     """Return the places (n,) that sort the points by code, those of one code by their bytes."""
-    order = np.argsort(codes, kind="stable")
+    order = sorted_places(codes)
     is_same = np.zeros(len(order), dtype=bool)
     is_same[1:] = codes[order[1:]] == codes[order[:-1]]
     if not is_same.any():

@@ -24,6 +24,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from dougong._sorting import grouped
 from dougong.cloud import Frame, Pieces
 from dougong.filters.neighbourhood import build_index, nearest
 from dougong.formats.model import Hold
@@ -273,7 +274,7 @@ def _across(better: Points, worse: Points, rule: _Rule) -> Values:
 
 def _is_dense(points: Points, own: Zones, other: Zones, params: Merge) -> Mask:
     """Return where the `other` source has its share of the density about each of `points`."""
-    keys, place = np.unique(own.grid.keys(own.grid.cells(points)), return_inverse=True)
+    keys, place, _ = grouped(own.grid.keys(own.grid.cells(points)))
     is_dense: Mask = other.around(keys) >= params.min_density_share * own.around(keys)
     return is_dense[place]
 

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._sorting import sorted_places
 from dougong.cloud import Frame, Records
 from dougong.formats.copc_parts import RecordFile
 from dougong.formats.model import Hold
@@ -87,7 +88,7 @@ def _sorted(records: Records) -> Records:
     raw = _bytes_of(records)
     width = raw.shape[1]
     first = _word(raw, 0)
-    order = np.argsort(first)
+    order = sorted_places(first)
     first = first[order]
     is_same = first[1:] == first[:-1]
     is_tied = np.concatenate(([False], is_same)) | np.concatenate((is_same, [False]))

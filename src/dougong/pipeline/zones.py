@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong._boxes import corners_of
+from dougong._sorting import grouped
 from dougong.typing import Index, Mask, Points, Values
 
 _LATTICE_M = 1e-4
@@ -122,9 +123,7 @@ class ZoneSums:
     def add(self, points: Points) -> None:
         """Count `points` (n, 3), metres, in."""
         cells = self.grid.cells(points)
-        keys, place, counts = np.unique(
-            self.grid.keys(cells), return_inverse=True, return_counts=True
-        )
+        keys, place, counts = grouped(self.grid.keys(cells))
         lattice = np.rint((points - (self.grid.low + cells * self.grid.edge_m)) / _LATTICE_M)
         count = len(keys)
         # Whole numbers far below 2**53: every sum is exact, whatever its order.

@@ -1,0 +1,50 @@
+"""Sorting by whole numbers, by radix: several times faster than comparing, and stable.
+
+The kernel is imported when called.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dougong.typing import Index
+
+_KEY_BITS = 64
+_SIGN = np.uint64(1 << 63)
+
+
+class Groups(NamedTuple):
+    """Equal numbers taken together, as by ``numpy.unique``."""
+
+    keys: NDArray[np.int64]
+    """(m,) each once, ascending."""
+    place: Index
+    """(n,) where in `keys` each number is."""
+    counts: Index
+    """(m,) how often each is there."""
+
+
+def sorted_places(keys: NDArray[np.uint64] | NDArray[np.int64]) -> Index:
+    """Return the places (n,) that sort `keys` (n,), equal ones in the order they came in."""
+    from dougong.kernels.order import radix_argsort
+
+    places = np.arange(len(keys), dtype=np.int64)
+    if len(keys) > 1:
+        # With the sign's bit turned over, negative numbers come first.
+        sign = _SIGN if keys.dtype == np.int64 else np.uint64(0)
+        spare = np.empty(len(keys), np.uint64)
+        radix_argsort(keys.view(np.uint64) ^ sign, _KEY_BITS, places, np.empty_like(places), spare)
+    return places
+
+
+def grouped(keys: NDArray[np.int64]) -> Groups:
+    """Return the groups of equal `keys` (n,)."""
+    order = sorted_places(keys)
+    ordered = keys[order]
+    is_first = np.ones(len(keys), np.bool_)
+    is_first[1:] = ordered[1:] != ordered[:-1]
+    place = np.empty(len(keys), np.int64)
+    place[order] = np.cumsum(is_first) - 1
+    starts = np.flatnonzero(is_first)
+    return Groups(ordered[starts], place, np.diff(np.append(starts, len(keys))))

@@ -1,0 +1,32 @@
+"""Sorting by radix is NumPy's stable sort, negative numbers and all."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from dougong._sorting import grouped, sorted_places
+
+SIZES = st.integers(0, 60)
+SOME = [-(2**63), -1, 0, 1, 7, 2**40, 2**63 - 1]
+SIGNED = arrays(np.int64, SIZES, elements=st.sampled_from(SOME))
+
+
+@settings(deadline=None)
+@given(SIGNED)
+def test_signed_numbers_are_sorted_stably(keys):
+    np.testing.assert_array_equal(sorted_places(keys), np.argsort(keys, kind="stable"))
+
+
+@settings(deadline=None)
+@given(arrays(np.uint64, SIZES, elements=st.integers(0, 2**64 - 1)))
+def test_unsigned_numbers_are_sorted_over_all_64_bits(keys):
+    np.testing.assert_array_equal(sorted_places(keys), np.argsort(keys, kind="stable"))
+
+
+@settings(deadline=None)
+@given(SIGNED)
+def test_groups_are_numpys(keys):
+    wanted = np.unique(keys, return_inverse=True, return_counts=True)
+    for found, right in zip(grouped(keys), wanted, strict=True):
+        np.testing.assert_array_equal(found, right)
