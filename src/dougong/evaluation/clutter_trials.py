@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dougong.evaluation.clutter_site import clutter_site
 from dougong.evaluation.clutter_things import PERSON, POLE, THINGS, VEHICLE, WIRE
 from dougong.evaluation.mesh import (
     CLUSTER,
+    CLUTTER,
     FINE,
     MIXED,
     NEAR_NOISE,
@@ -20,13 +22,15 @@ from dougong.evaluation.mesh import (
     VEGETATION,
     load_mesh,
 )
-from dougong.evaluation.scenes import scan_mesh
+from dougong.evaluation.scenes import make_scene, scan_mesh
 from dougong.filters.cloth_simulation import GROUND, ClothSimulation, cloth_simulation
 from dougong.filters.clutter import Clutter, clutter
 from dougong.filters.clutter_kinds import ClutterKind
 from dougong.filters.curvature_weighted import curvature_weighted
 from dougong.filters.low_outliers import low_outliers
+from dougong.filters.selection import Reason
 from dougong.formats import read
+from dougong.pipeline.recipes import PhotogrammetryRecipe, Recipe, filter_cloud
 from dougong.typing import Index, Points, Values
 
 MESHES = {
@@ -88,9 +92,7 @@ def trial(
         )
     sorts: dict[str, tuple[int, ...]] = {**_STILL, **{name: (k,) for k, name in THINGS.items()}}
     for name, those in sorts.items():
-        counts = np.bincount(kinds[np.isin(labels, those)], minlength=len(ClutterKind))
-        taken = {k.name.lower(): int(counts[k]) for k in ClutterKind}
-        rows.append({**about, "points_on": name, **taken})
+        rows.append({**about, "points_on": name, **_taken(kinds[np.isin(labels, those)])})
     return rows
 
 
@@ -102,6 +104,32 @@ def _off_ground(points: Points) -> tuple[Index, Values]:
     left, height = left[is_off], cloth.attributes["height_above_ground"][is_off]
     is_kept = curvature_weighted(points[left]).is_kept
     return left[is_kept], height[is_kept]
+
+
+def drone_trial(kind: str, seed: int, points: int = 500_000) -> list[dict[str, Any]]:
+    """Do the same on a drone cloud of `make_scene`, with its recipe: a row per sort of points.
+
+    Its people and cars have one label; poles and wires there are none.
+    """
+    scene = make_scene(kind, seed, lidar_points=50_000, photogrammetry_points=points)
+    cloud = scene.photogrammetry
+    recipe = Recipe(photogrammetry=PhotogrammetryRecipe(clutter=Clutter()))
+    filtered = filter_cloud(cloud, "photogrammetry", recipe)
+    is_asked = (filtered.codes == Reason.KEPT) & (filtered.ground_class != GROUND)
+    labels = cloud.attribute("truth_label")
+    assert labels is not None
+    kinds, labels = filtered.details["dougong_clutter"][is_asked], labels[is_asked]
+    sorts = {**_STILL, "people and cars": (CLUTTER,)}
+    return [
+        {"building": kind, "seed": seed, "points_on": name, **_taken(kinds[np.isin(labels, those)])}
+        for name, those in sorts.items()
+    ]
+
+
+def _taken(kinds: NDArray[np.uint8]) -> dict[str, int]:
+    """Return how many points were taken for each kind."""
+    counts = np.bincount(kinds, minlength=len(ClutterKind))
+    return {k.name.lower(): int(counts[k]) for k in ClutterKind}
 
 
 def real_offers(folder: Path) -> Iterator[dict[str, Any]]:
