@@ -9,13 +9,15 @@ from dougong.errors import InputError
 from dougong.evaluation import clutter_things as things
 from dougong.evaluation.mesh import join
 from dougong.evaluation.solids import block
+from dougong.filters import wires
 from dougong.filters.cloth_simulation import GROUND, ClothSimulation, cloth_simulation
-from dougong.filters.clusters import clusters_of
+from dougong.filters.clusters import clusters_of, eighth_nearest
 from dougong.filters.clutter import Clutter, clutter
 from dougong.filters.clutter_kinds import ClutterKind
 from dougong.filters.clutter_shapes import shape_of
 from dougong.filters.neighbourhood import build_index
 from dougong.kernels import clusters as kernels
+from dougong.threads import get_threads, set_threads
 from dougong.tiles.engine import local_engine
 from dougong.tiles.stages import TileBench
 from reference import clusters as reference
@@ -59,6 +61,24 @@ def test_the_rectangle_is_the_least_of_all_angles(seed, count):
     long, wide = reference.least_rectangle(plan)
     assert length * width <= long * wide * (1 + 1e-9)
     assert length * width >= long * wide - 0.05
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=15, deadline=None)
+def test_wires_are_those_of_the_plain_definition(seed):
+    rng = np.random.default_rng(seed)
+    parts = [rng.uniform(0, 6, (rng.integers(0, 60), 3)) + (0, 0, 2)]
+    for _ in range(rng.integers(1, 4)):
+        start, stop = rng.uniform(0, 6, (2, 3)) * (1, 1, 0.5) + (0, 0, 2)
+        parts.append(start + rng.random((rng.integers(5, 90), 1)) * (stop - start))
+    points = np.concatenate(parts)
+    points += rng.normal(0, 0.01, points.shape)
+    index = build_index(points)
+    height = index.points[:, 2]
+    lines = wires.thin_lines(index, height, eighth_nearest(index, 0.5), 2.5)
+    found = wires.runs_of_wires(index, lines)
+    expected = reference.runs_of_wires(points, points[:, 2], 2.5, 0.5, wires)
+    np.testing.assert_allclose(found, expected[index.order])
 
 
 RNG = np.random.default_rng(5)
@@ -131,6 +151,12 @@ def test_nothing_depends_on_order_or_place_and_turns_do_no_harm():
     again = clutter(up[order], height_above_ground=up[order, 2])
     for name, values in found.attributes.items():
         np.testing.assert_array_equal(again.attributes[name], values[order])
+    before = get_threads()
+    set_threads(1)
+    alone = clutter(up, height_above_ground=up[:, 2])
+    set_threads(before)
+    for name, values in found.attributes.items():
+        np.testing.assert_array_equal(alone.attributes[name], values)
     moved = clutter(up + (512.0, -1024.0, 64.0), height_above_ground=up[:, 2])
     np.testing.assert_array_equal(moved.attributes["clutter_kind"], kinds)
     c, s = np.cos(0.7), np.sin(0.7)
