@@ -15,7 +15,7 @@ ALLOWED = {
     "cloud": BASE,
     "filters": BASE | {"cloud", "kernels"},
     "formats": BASE | {"_sorting", "cloud", "kernels"},
-    "registration": BASE | {"cloud", "kernels", "filters"},
+    "registration": BASE | {"_sorting", "cloud", "kernels", "filters"},
     "tiles": BASE | {"cloud", "kernels", "filters", "formats"},
     "pipeline": BASE
     | {"_sorting", "cloud", "kernels", "filters", "formats", "registration", "tiles"},

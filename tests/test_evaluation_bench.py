@@ -11,7 +11,7 @@ from dougong.cli import call
 from dougong.evaluation.bench import ours, peers
 from dougong.evaluation.bench.contenders import OPERATIONS
 from dougong.evaluation.bench.scenes import SCENES
-from dougong.evaluation.bench.table import as_markdown
+from dougong.evaluation.bench.table import as_markdown, fastest_peer
 
 COUNT = 30_000
 
@@ -62,6 +62,18 @@ def test_scenes_are_the_same_for_a_seed():
     for make in SCENES.values():
         one, two = make(COUNT, 3), make(COUNT, 3)
         assert all(np.array_equal(one[key], two[key]) for key in one)
+
+
+def test_who_ends_far_away_is_not_compared_by_seconds():
+    def row(name, error_mm, cpu_s, *, is_ours=False):
+        figures = {"cpu_s": cpu_s, "wall_s": cpu_s, "bytes": 1e6}
+        about = {"name": name, "is_ours": is_ours, "is_equal": True, "failed": None}
+        return {**about, **figures, "answer": {"displacement_p95_mm": error_mm}}
+
+    rows = [row("ours", 0.8, 4.0, is_ours=True), row("hasty", 14.0, 0.9)]
+    assert fastest_peer({"rows": rows}) is None
+    rows.append(row("exact", 1.2, 9.0))
+    assert fastest_peer({"rows": rows})["name"] == "exact"
 
 
 def test_the_readme_shows_what_was_measured():

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._sorting import Groups, grouped, sorted_places
 from dougong.typing import Index, Mask, Points
 
 _PATCH_POINTS = 16
@@ -67,7 +68,7 @@ def sensor_noise(points: Points) -> float:
     edge = patch_edge_m(points) * 1.5
     points = points[in_some_blocks(points, 8.0 * edge)]
     _, place, counts = _voxels(points, edge)
-    order = np.argsort(place, kind="stable")
+    order = sorted_places(place)
     starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
     ordered = points[order]
     offset = ordered - np.repeat(ordered[starts], counts, axis=0)
@@ -114,11 +115,8 @@ def _strides(low: NDArray[np.float64], high: NDArray[np.float64], edge: float) -
     return np.array([size[1] * size[2], size[2], 1], dtype=np.int64)
 
 
-def _voxels(points: Points, edge: float) -> tuple[Index, Index, Index]:
-    """Return sorted keys of occupied voxels, the voxel of each point, points per voxel."""
+def _voxels(points: Points, edge: float) -> Groups:
+    """Return the occupied voxels, the voxel of each point, points per voxel."""
     low, high = extent(points)
     cell = np.floor((points - low) / edge).astype(np.int64) + 1
-    keys, place, counts = np.unique(
-        cell @ _strides(low, high, edge), return_inverse=True, return_counts=True
-    )
-    return keys, place, counts
+    return grouped(cell @ _strides(low, high, edge))

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._sorting import grouped
 from dougong.registration.icp_solve import FREE, normal_equations, plane_rows, solve
 from dougong.registration.overlap import Pairs
 from dougong.typing import Index, Points, Values
@@ -30,8 +31,8 @@ def blocks_of(points: Points, size_m: float) -> tuple[Index, int]:
     cell -= cell.min(axis=0)
     size = cell.max(axis=0) + 1
     key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
-    keys, block = np.unique(key, return_inverse=True)
-    return block.reshape(-1).astype(np.int64), len(keys)
+    blocks = grouped(key)
+    return blocks.place, len(blocks.keys)
 
 
 class Jackknife(NamedTuple):

@@ -12,6 +12,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from dougong._sorting import sorted_places
 from dougong.filters import neighbourhood
 from dougong.filters.neighbourhood import Neighbourhood, build_index
 from dougong.registration.prepare import Prepared
@@ -78,7 +79,9 @@ def thin(points: Points, spacing_m: float) -> Index:
     cell -= low
     size = cell.max(axis=0) + 1.0
     key = ((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]).astype(np.int64)
-    order = np.lexsort((np.einsum("ij,ij->i", off, off), key))
+    # Numbers that are not negative are in the order of their bits.
+    by_distance = sorted_places(np.einsum("ij,ij->i", off, off).view(np.uint64))
+    order = by_distance[sorted_places(key[by_distance])]
     is_first = np.ones(len(order), dtype=bool)
     is_first[1:] = key[order[1:]] != key[order[:-1]]
     kept: Index = order[is_first]

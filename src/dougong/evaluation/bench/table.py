@@ -5,6 +5,10 @@ from typing import Any
 
 Row = Mapping[str, Any]
 
+_ERROR = "displacement_p95_mm"
+"""Where an answer has an error, only those that get about as near have done the same work."""
+_AS_NEAR, _NEAR_ENOUGH_MM = 2.0, 1.0
+
 
 def ours_of(group: Row) -> Row | None:
     """Return our row of a group, if it was measured."""
@@ -13,8 +17,31 @@ def ours_of(group: Row) -> Row | None:
 
 def fastest_peer(group: Row, key: str = "cpu_s") -> Row | None:
     """Return the peer's row with the least of `key`, of those that do equal work."""
-    peers = [r for r in group["rows"] if not r["is_ours"] and r["is_equal"] and _ok(r)]
+    peers = [row for row in _peers(group) if _gets_as_near(row, ours_of(group))]
     return min(peers, key=lambda row: float(row[key])) if peers else None
+
+
+def _peers(group: Row) -> list[Row]:
+    return [r for r in group["rows"] if not r["is_ours"] and r["is_equal"] and _ok(r)]
+
+
+def _gets_as_near(row: Row, ours: Row | None) -> bool:
+    if ours is None or _ERROR not in ours["answer"]:
+        return True
+    most = max(_AS_NEAR * ours["answer"][_ERROR], _NEAR_ENOUGH_MM)
+    return bool(row["answer"][_ERROR] <= most)
+
+
+def _nearest_in_words(group: Row) -> str:
+    """Return which peer gets nearest, where none gets as near as we do; "none" without peers."""
+    ours, peers = ours_of(group), _peers(group)
+    if ours is None or not peers:
+        return "none"
+    best = min(peers, key=lambda row: float(row["answer"][_ERROR]))
+    return (
+        f"none to {ours['answer'][_ERROR]:.2g} mm; {best['name']} to "
+        f"{best['answer'][_ERROR]:.2g} mm in {_seconds(best['cpu_s'])}"
+    )
 
 
 def _ok(row: Row) -> bool:
@@ -38,9 +65,10 @@ def as_text(document: Row) -> str:
                 lines.append(f"  {row['name']:26s}failed: {row['failed']}")
                 continue
             ratio = ""
-            if ours is not None and row is not ours:
+            if ours is not None and row is not ours and _gets_as_near(row, ours):
                 ratio = f"{row['cpu_s'] / max(ours['cpu_s'], 1e-9):.2f}"
             mark = "" if row["is_equal"] else " (not equal work)"
+            mark += "" if _gets_as_near(row, ours) else " (not as near)"
             lines.append(
                 f"  {row['name']:26s}{row['cpu_s']:9.3f}{row['wall_s']:9.3f}"
                 f"{row['bytes'] / 1e6:8.0f}{ratio:>8s}  {_answer(row)}{mark}"
@@ -70,7 +98,7 @@ def as_markdown(document: Row) -> str:
             f"| {_seconds(ours['cpu_s'])} |"
         )
         if peer is None:
-            lines.append(f"{left} none | | | {ours['bytes'] / 1e6:.0f} |")
+            lines.append(f"{left} {_nearest_in_words(group)} | | | {ours['bytes'] / 1e6:.0f} |")
             continue
         quick = fastest_peer(group, "wall_s") or peer
         lines.append(
