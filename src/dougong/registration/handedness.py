@@ -14,7 +14,7 @@ import numpy as np
 
 from dougong.filters.neighbourhood import build_index
 from dougong.registration.evidence import Court, Testimony, Witness, hear
-from dougong.registration.icp import Icp, Level, refine_levels
+from dougong.registration.icp import Icp, Level, refined_pose
 from dougong.registration.overlap import Rung
 from dougong.registration.rivals import propose_mirrored
 from dougong.registration.verdict import Verdict, compare, is_beaten
@@ -48,7 +48,7 @@ def handedness(
         for level in levels
     )
     flip = np.diag([*_FLIP, 1.0])
-    heard = [hear(other, refine_levels(mirrored, T @ flip, icp).T_target_source) for T in poses]
+    heard = [hear(other, refined_pose(mirrored, T @ flip, icp)) for T in poses]
     best = min(heard, key=lambda testimony: testimony.total)
     if is_beaten(compare(court, winner, best, params.block_m), params):
         return "right"

@@ -145,15 +145,31 @@ def refine(
 
 def refine_levels(levels: tuple[Level, ...], T_initial: Transform, params: Icp) -> FineResult:
     """Return `refine` on levels built before."""
+    history: list[Mapping[str, float]] = []
+    T, stopped = _climbed(levels, T_initial, params, history)
+    return _result(levels[-1], T, params, stopped, history)
+
+
+def refined_pose(levels: tuple[Level, ...], T_initial: Transform, params: Icp) -> Transform:
+    """Return the pose of `refine` alone, on levels built before: a third of the work is figures."""
+    return _climbed(levels, T_initial, params, [])[0]
+
+
+def _climbed(
+    levels: tuple[Level, ...],
+    T_initial: Transform,
+    params: Icp,
+    history: list[Mapping[str, float]],
+) -> tuple[Transform, str]:
+    """Return the pose at the top of the levels, and why its last level ended."""
     T = as_transform(T_initial, "T_initial")
     if params.dof == 4:
         T = levelled(T, levels[-1].target.xyz.mean(axis=0))
-    history: list[Mapping[str, float]] = []
     stopped = "not started"
     for number, level in enumerate(levels):
         tolerance = params.tolerance_m * (1.0 if number == len(levels) - 1 else 20.0)
         T, stopped = _run_level(level, T, params, number, tolerance, history)
-    return _result(levels[-1], T, params, stopped, history)
+    return T, stopped
 
 
 def _run_level(

@@ -26,7 +26,7 @@ from dougong.registration.evidence import (
     support,
     violation,
 )
-from dougong.registration.icp import Icp, Level, refine_levels
+from dougong.registration.icp import Icp, Level, refined_pose
 from dougong.registration.overlap import apply, inverse
 from dougong.registration.randomisation import sign_flip, student
 from dougong.registration.result import FineResult, Status
@@ -304,7 +304,7 @@ def shared_chance(
 
 
 def _refined(court: Court, levels: tuple[Level, ...], T: Transform, icp: Icp) -> Testimony:
-    return hear(court, refine_levels(levels, T, icp).T_target_source)
+    return hear(court, refined_pose(levels, T, icp))
 
 
 def status_of(ruling: Ruling, fine: FineResult | None, params: Verdict) -> tuple[Status, str]:
