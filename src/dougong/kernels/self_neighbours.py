@@ -5,6 +5,8 @@ triangle inequality then says how far those of the others can be, and every leaf
 looked at in one go, without asking the tree again.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from dougong.kernels._arrays import Floats, Ints
@@ -172,6 +174,63 @@ def _select(
 
 
 @kernel
+def _finish(places: Ints, d2s: Floats, held: int) -> None:
+    """Say where fewer than k were found."""
+    places[held:] = -1
+    d2s[held:] = np.inf
+
+
+class _Near(NamedTuple):
+    """The candidates of a leaf, and room to choose among them."""
+
+    points: Floats
+    """(3, `_MOST`)."""
+    who: Ints
+    """(`_MOST`,) their places."""
+    squares: Floats
+    chosen: Ints
+
+
+@kernel
+def _choose(
+    points: Floats,
+    near: _Near,
+    held: int,
+    i: int,
+    begin: int,
+    stop: int,
+    known_m: Floats,
+    max_distance2: float,
+    places: Ints,
+    d2s: Floats,
+) -> int:
+    """Fill the sorted lists (k,) with the nearest of the candidates to point i; return how many.
+
+    known_m (stop - begin,): how far the k-th neighbour of points begin .. stop - 1 is; inf where
+    it is not known. They say how far this one's can be, for their neighbours are in its reach.
+    """
+    reach = np.inf
+    for j in range(begin, stop):
+        reach = min(reach, known_m[j - begin] + _distance(points, j, i))
+    limit2 = min(reach * reach * _SLACK, max_distance2)
+    d2s[:] = limit2
+    _squares(near.points, held, points[i, 0], points[i, 1], points[i, 2], near.squares)
+    count = _within(near.squares, held, limit2, near.chosen)
+    return _select(points, near.who, near.squares, near.chosen, count, i, places, d2s)
+
+
+@kernel
+def _reach2(
+    points: Floats, first: int, begin: int, end: int, known_m: float, max_distance2: float
+) -> float:
+    """Return the squared distance within which all k neighbours of points begin .. end - 1 lie."""
+    reach = 0.0
+    for i in range(begin, end):
+        reach = max(reach, known_m + _distance(points, first, i))
+    return float(min(reach * reach * _SLACK, max_distance2))
+
+
+@kernel
 def self_knn(
     points: Floats,
     boxes: Floats,
@@ -186,54 +245,38 @@ def self_knn(
     Rows follow the sorted order, from the first point of first_leaf: places and d2s (m, k), nearest
     first; -1 and inf where fewer than k are in reach (max_distance2, inclusive).
     """
-    n, k = points.shape[0], d2s.shape[1]
-    leaves = boxes.shape[0] // 2
+    n, k, leaves = points.shape[0], d2s.shape[1], boxes.shape[0] // 2
     stack, bound = np.empty(_DEPTH, np.int64), np.empty(_DEPTH, np.float64)
-    near, who = np.empty((3, _MOST), np.float64), np.empty(_MOST, np.int64)
-    squares, chosen = np.empty(_MOST, np.float64), np.empty(_MOST, np.int64)
-    farthest = np.empty(_LEAF, np.float64)
+    near = _Near(
+        np.empty((3, _MOST), np.float64),
+        np.empty(_MOST, np.int64),
+        np.empty(_MOST, np.float64),
+        np.empty(_MOST, np.int64),
+    )
+    known_m = np.empty(_LEAF, np.float64)
     offset = first_leaf * n // leaves
     for leaf in range(first_leaf, last_leaf):
         begin, end = leaf * n // leaves, (leaf + 1) * n // leaves
         first = _middle_of(points, boxes, leaves + leaf, begin, end)
-        row = first - offset
-        found = _search(
-            points, boxes, first, leaf, max_distance2, stack, bound, places[row], d2s[row]
-        )
-        _finish(places[row], d2s[row], found)
-        usual = np.sqrt(d2s[row, k - 1])
-        reach = 0.0
-        for i in range(begin, end):
-            reach = max(reach, usual + _distance(points, first, i))
-        reach2 = min(reach * reach * _SLACK, max_distance2)
+        known_m[:] = np.inf
         held = -1
-        if reach2 < np.inf:
-            held = _gather(points, boxes, leaves + leaf, reach2, stack, near, who)
-        farthest[first - begin] = usual
-        for i in range(begin, end):
-            if i == first:
-                continue
+        for turn in range(begin, end):
+            # The middle one comes first, then the others in their order.
+            i = first if turn == begin else turn - 1 if turn <= first else turn
             row = i - offset
             if held < 0:
                 found = _search(
                     points, boxes, i, leaf, max_distance2, stack, bound, places[row], d2s[row]
                 )
             else:
-                # Those that are done say how far this one's can be: their k are in its reach.
-                reach = usual + _distance(points, first, i)
-                for j in range(begin, i):
-                    reach = min(reach, farthest[j - begin] + _distance(points, j, i))
-                limit2 = min(reach * reach * _SLACK, max_distance2)
-                d2s[row, :] = limit2
-                _squares(near, held, points[i, 0], points[i, 1], points[i, 2], squares)
-                count = _within(squares, held, limit2, chosen)
-                found = _select(points, who, squares, chosen, count, i, places[row], d2s[row])
+                found = _choose(
+                    points, near, held, i, begin, end, known_m, max_distance2, places[row], d2s[row]
+                )
             _finish(places[row], d2s[row], found)
-            farthest[i - begin] = np.sqrt(d2s[row, k - 1])
-
-
-@kernel
-def _finish(places: Ints, d2s: Floats, held: int) -> None:
-    """Say where fewer than k were found."""
-    places[held:] = -1
-    d2s[held:] = np.inf
+            known_m[i - begin] = np.sqrt(d2s[row, k - 1])
+            if i == first:
+                reach2 = _reach2(points, i, begin, end, known_m[i - begin], max_distance2)
+                if reach2 < np.inf:
+                    held = _gather(
+                        points, boxes, leaves + leaf, reach2, stack, near.points, near.who
+                    )
