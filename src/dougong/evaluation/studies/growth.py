@@ -179,6 +179,12 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return table
 
 
+def _plain(value: float, _place: int) -> str:
+    """Return the label of a tick on a logarithmic axis: of 1, 2 and 5 times a power of ten."""
+    lead = value / 10.0 ** np.floor(np.log10(value) + 1e-9)
+    return f"{value:,g}" if round(lead, 6) in (1.0, 2.0, 5.0) else ""
+
+
 def draw_growth(table: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Draw errors, processor seconds and memory over the number of points, as PNG."""
     figure = new_figure(11.0, 7.0)
@@ -206,6 +212,9 @@ def draw_growth(table: Sequence[Mapping[str, Any]], path: Path) -> None:
         panel.set_yscale("log")
         panel.set_ylabel(words, fontsize=9)
         panel.grid(alpha=0.3, which="both")
+        for axis in (panel.xaxis, panel.yaxis):
+            axis.set_major_formatter(_plain)
+            axis.set_minor_formatter(_plain)
     for panel in panels[1]:
         panel.set_xlabel("points of both clouds", fontsize=9)
     handles, labels = panels[0, 0].get_legend_handles_labels()
