@@ -18,8 +18,6 @@ from dougong.kernels import boxtree, moments, neighbours, order, self_neighbours
 from dougong.threads import for_blocks
 from dougong.typing import Index, Points, Values
 
-_LEAF = 16
-"""At most this many points in a leaf (and at least half as many)."""
 _SUBTREES = 32
 """Parts of the tree that are built apart, on the threads."""
 _BLOCK = 32_768
@@ -82,7 +80,7 @@ def _sort_crowded(points: Points, places: Index, starts: Index) -> None:
     """Sort again, in place, the runs of `places` that begin at `starts` and are too long."""
     stops = np.append(starts[1:], len(places))
     # A run as long as the whole is either one place repeated or too small to be told apart.
-    is_crowded = (stops - starts > 2 * _LEAF) & (stops - starts < len(places))
+    is_crowded = (stops - starts > 2 * boxtree.LEAF) & (stops - starts < len(places))
     for first, last in zip(starts[is_crowded], stops[is_crowded], strict=True):
         run = places[first:last]
         inside = points[run]
@@ -96,7 +94,7 @@ def build_index(points: ArrayLike) -> Neighbourhood:
     n = len(ordered)
     places = np.arange(n, dtype=np.int64)
     leaves = 1
-    while n > leaves * _LEAF:
+    while n > leaves * boxtree.LEAF:
         leaves *= 2
     boxes = np.full((2 * leaves, 6), np.inf)
     top = min(leaves, _SUBTREES)
@@ -239,7 +237,7 @@ def _self_knn(index: Neighbourhood, k: int, limit2: float) -> tuple[Index, Value
 
 def blocks_of_leaves(index: Neighbourhood) -> tuple[int, int]:
     """Return (leaves, leaves per block): what `for_blocks` needs to visit the index in order."""
-    return len(index.boxes) // 2, _BLOCK // _LEAF
+    return len(index.boxes) // 2, _BLOCK // boxtree.LEAF
 
 
 def self_knn_block(

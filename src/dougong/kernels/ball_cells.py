@@ -9,7 +9,8 @@ import numpy as np
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel
 from dougong.kernels.ball_walk import SHARE, look, make_walk
-from dougong.kernels.balls import LEAF, add_moved, variation_of
+from dougong.kernels.balls import add_moved, add_point, variation_of
+from dougong.kernels.boxtree import LEAF
 
 _CHUNK = 32
 """Leaves on the rim that are looked at together: their cells fit the fast cache."""
@@ -27,18 +28,8 @@ def cell_moments(
     out[first:last] = 0
     for c in range(first, last):
         for k in range(starts[runs[c]], starts[runs[c] + 1]):
-            i = places[k]
-            x, y, z = np.int64(points[i, 0]), np.int64(points[i, 1]), np.int64(points[i, 2])
             out[c, 0] += 1
-            out[c, 1] += x
-            out[c, 2] += y
-            out[c, 3] += z
-            out[c, 4] += x * x
-            out[c, 5] += y * y
-            out[c, 6] += z * z
-            out[c, 7] += x * y
-            out[c, 8] += x * z
-            out[c, 9] += y * z
+            add_point(points, places[k], out[c, 1:])
 
 
 @kernel

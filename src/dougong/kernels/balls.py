@@ -11,14 +11,27 @@ import numpy as np
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel, summing_kernel
 from dougong.kernels.ball_walk import SHARE, look, make_walk, size_of
-from dougong.kernels.boxtree import box_distance2
+from dougong.kernels.boxtree import LEAF, box_distance2
 from dougong.kernels.moments import eigen3
 
 _DEPTH = 64
-LEAF = 16
-"""Most points of a leaf, see `build_index`."""
 _CHUNK = 64
 """Leaves on the rim that are looked at together: their points fit the fast cache."""
+
+
+@kernel
+def add_point(points: Floats, i: int, out: Ints) -> None:
+    """Add x, y, z, xx, yy, zz, xy, xz, yz of point i, whole numbers, to out (9,)."""
+    x, y, z = np.int64(points[i, 0]), np.int64(points[i, 1]), np.int64(points[i, 2])
+    out[0] += x
+    out[1] += y
+    out[2] += z
+    out[3] += x * x
+    out[4] += y * y
+    out[5] += z * z
+    out[6] += x * y
+    out[7] += x * z
+    out[8] += y * z
 
 
 @kernel
@@ -32,16 +45,7 @@ def node_moments(points: Floats, out: Ints) -> None:
     for leaf in range(leaves):
         node = leaves + leaf
         for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
-            x, y, z = np.int64(points[i, 0]), np.int64(points[i, 1]), np.int64(points[i, 2])
-            out[node, 0] += x
-            out[node, 1] += y
-            out[node, 2] += z
-            out[node, 3] += x * x
-            out[node, 4] += y * y
-            out[node, 5] += z * z
-            out[node, 6] += x * y
-            out[node, 7] += x * z
-            out[node, 8] += y * z
+            add_point(points, i, out[node])
     for node in range(leaves - 1, 0, -1):
         for c in range(9):
             out[node, c] = out[2 * node, c] + out[2 * node + 1, c]

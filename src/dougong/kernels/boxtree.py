@@ -12,6 +12,9 @@ import numpy as np
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel
 
+LEAF = 16
+"""At most this many points in a leaf (and at least half as many)."""
+
 
 @kernel
 def _swap(points: Floats, places: Ints, i: int, j: int) -> None:

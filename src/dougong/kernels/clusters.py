@@ -11,23 +11,9 @@ import numpy as np
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel
 from dougong.kernels.boxtree import box_distance2, box_far_distance2, comes_first
+from dougong.kernels.disjoint import join, root_of
 
 _DEPTH = 64
-
-
-@kernel
-def _root(parent: Ints, i: int) -> int:
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
-@kernel
-def _join(parent: Ints, i: int, j: int) -> None:
-    a, b = _root(parent, i), _root(parent, j)
-    if a != b:
-        parent[max(a, b)] = min(a, b)
 
 
 @kernel
@@ -48,13 +34,13 @@ def _refresh(parent: Ints, ends: Ints, label: Ints) -> None:
     for node in range(2 * leaves - 1, 0, -1):
         if node < leaves:
             a, b = label[2 * node], label[2 * node + 1]
-            is_one = a >= 0 and b >= 0 and _root(parent, a) == _root(parent, b)
-            label[node] = _root(parent, a) if is_one else -1
+            is_one = a >= 0 and b >= 0 and root_of(parent, a) == root_of(parent, b)
+            label[node] = root_of(parent, a) if is_one else -1
             continue
         first = (node - leaves) * n // leaves
-        root = _root(parent, first)
+        root = root_of(parent, first)
         for i in range(first + 1, ends[node]):
-            if _root(parent, i) != root:
+            if root_of(parent, i) != root:
                 root = -1
                 break
         label[node] = root
@@ -80,7 +66,7 @@ def _join_small_nodes(boxes: Floats, ends: Ints, least2: float, parent: Ints) ->
                 level *= 2
             first = (node - level) * n // level
             for i in range(first + 1, ends[node]):
-                _join(parent, first, i)
+                join(parent, first, i)
         elif node < leaves:
             stack[height] = 2 * node
             stack[height + 1] = 2 * node + 1
@@ -108,7 +94,7 @@ def link_within(points: Floats, boxes: Floats, gap: Floats, least: float, parent
             _refresh(parent, ends, label)
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         reach2 = gap[i] * gap[i]
-        root = _root(parent, i)
+        root = root_of(parent, i)
         stack[0] = 1
         height = 1
         while height > 0:
@@ -116,7 +102,7 @@ def link_within(points: Floats, boxes: Floats, gap: Floats, least: float, parent
             node = stack[height]
             if ends[node] <= i or box_distance2(boxes, node, x, y, z) > reach2:
                 continue
-            if label[node] >= 0 and _root(parent, label[node]) == root:
+            if label[node] >= 0 and root_of(parent, label[node]) == root:
                 continue
             if node < leaves:
                 stack[height] = 2 * node
@@ -124,14 +110,14 @@ def link_within(points: Floats, boxes: Floats, gap: Floats, least: float, parent
                 height += 2
                 continue
             for j in range(max(i + 1, (node - leaves) * n // leaves), ends[node]):
-                if _root(parent, j) == root:
+                if root_of(parent, j) == root:
                     continue
                 dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
                 if dx * dx + dy * dy + dz * dz <= min(reach2, gap[j] * gap[j]):
-                    _join(parent, i, j)
-                    root = _root(parent, i)
+                    join(parent, i, j)
+                    root = root_of(parent, i)
     for i in range(n):
-        parent[i] = _root(parent, i)
+        parent[i] = root_of(parent, i)
 
 
 @kernel

@@ -8,6 +8,7 @@ import numpy as np
 
 from dougong.kernels._arrays import Flags, Floats, Ints
 from dougong.kernels._jit import kernel
+from dougong.kernels.disjoint import join, root_of
 from dougong.kernels.raster import rounded
 
 
@@ -131,14 +132,6 @@ def mark_strong(
 
 
 @kernel
-def _root(parent: Ints, v: int) -> int:
-    while parent[v] != v:
-        parent[v] = parent[parent[v]]
-        v = parent[v]
-    return v
-
-
-@kernel
 def link_surfaces(
     unique: Ints,
     starts: Ints,
@@ -173,12 +166,10 @@ def link_surfaces(
             u = first_at_or_above(unique, starts[r * columns + c], stop, base + max(0, k - reach))
             while u < stop and unique[u] <= base + min(k + reach, levels - 1):
                 if is_strong[u]:
-                    a = _root(parent, v)
-                    b = _root(parent, u)
-                    parent[max(a, b)] = min(a, b)
+                    join(parent, v, u)
                 u += 1
     for v in range(unique.shape[0]):
-        parent[v] = _root(parent, v)
+        parent[v] = root_of(parent, v)
 
 
 @kernel

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel
 from dougong.kernels.boxtree import box_distance2
+from dougong.kernels.disjoint import join, root_of
 from dougong.kernels.moments import eigen3
 
 Small = NDArray[np.int32]
@@ -170,14 +171,6 @@ def support(
 
 
 @kernel
-def _root(parent: Ints, i: int) -> int:
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
-@kernel
 def link(
     points: Floats, places: Small, frame: Singles, spacing: Floats, reach: float, parent: Ints
 ) -> None:
@@ -195,11 +188,9 @@ def link(
             up, across, along = _parts2(points, frame, i, j)
             far = reach * max(spacing[i], spacing[j])
             if up + across + along / (frame[j, 8] * frame[j, 8]) <= far * far:
-                a, b = _root(parent, i), _root(parent, j)
-                if a != b:
-                    parent[max(a, b)] = min(a, b)
+                join(parent, i, j)
     for i in range(n):
-        parent[i] = _root(parent, i)
+        parent[i] = root_of(parent, i)
 
 
 @kernel

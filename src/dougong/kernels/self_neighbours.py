@@ -11,12 +11,10 @@ import numpy as np
 
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel
-from dougong.kernels.boxtree import comes_first
+from dougong.kernels.boxtree import LEAF, comes_first
 from dougong.kernels.neighbours import descend, insert, scan_leaf
 
 _DEPTH = 64
-_LEAF = 16
-"""Most points of a leaf, see `build_index`."""
 _MOST = 1024
 """More candidates than this are not worth it: each point is then searched for in the tree."""
 _SLACK = 1.0 + 1e-9
@@ -253,7 +251,7 @@ def self_knn(
         np.empty(_MOST, np.float64),
         np.empty(_MOST, np.int64),
     )
-    known_m = np.empty(_LEAF, np.float64)
+    known_m = np.empty(LEAF, np.float64)
     offset = first_leaf * n // leaves
     for leaf in range(first_leaf, last_leaf):
         begin, end = leaf * n // leaves, (leaf + 1) * n // leaves
