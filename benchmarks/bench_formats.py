@@ -7,7 +7,7 @@ intensity on map coordinates; the libraries hold raw columns where we hold a clo
 on (local coordinates, bad rows found, units and step known).
 """
 
-import sys
+import argparse
 import tempfile
 import time
 from collections.abc import Callable
@@ -21,6 +21,8 @@ from plyfile import PlyData
 
 from dougong.cloud import Cloud, Frame
 from dougong.formats import read, reissue, write
+
+FORMATS = ("las", "laz", "copc.laz", "e57", "ply", "csv")
 
 
 def scan(count: int) -> Cloud:
@@ -75,8 +77,11 @@ def pye57_writes(path: Path, out: Path) -> None:
 
 def main() -> None:
     """Print the table."""
-    count = int(float(sys.argv[1])) if len(sys.argv) > 1 else 3_000_000
-    wanted = sys.argv[2:] or ["las", "laz", "copc.laz", "e57", "ply", "csv"]
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("points", nargs="?", type=float, default=3e6)
+    parser.add_argument("formats", nargs="*", default=FORMATS)
+    asked = parser.parse_args()
+    count, wanted = int(asked.points), asked.formats
     cloud = scan(count)
     print(f"{count:,} points; CPU seconds\n")
     print("| work | dougong | library alone | ratio |\n|---|---|---|---|")

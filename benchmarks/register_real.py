@@ -25,9 +25,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hard_trials import Points, inverse, moved, pose
 
 from dougong.cloud import Cloud
+from dougong.evaluation.hard_trials import Points, inverse, moved, pose
 from dougong.evaluation.metrics import Truth, pose_errors
 from dougong.formats import read
 from dougong.registration import Register, register
