@@ -8,7 +8,7 @@
 points: six halls and their yard seen from twelve stations, dense near these, 2 mm noise, stray
 points) and drone.laz (15 %: roofs, walls and yard at an even density, 15 mm noise). `filter` runs
 both recipes, `run` the main job; both print the largest sum of proportional set sizes (PSS) of the
-process tree, sampled every 0.1 s (Linux only), beside the wall and processor time, and the time to
+process tree, sampled every 0.25 s (Linux only), beside the wall and processor time, and the time to
 merely decode the input with laspy and lazrs on all threads, measured before and after. `--voxel` is
 the edge of the scan's voxel grid; `run` says what share it kept (0.06 keeps about 15 % at 3e7).
 """
@@ -130,7 +130,7 @@ def measured(command: list[str]) -> dict[str, Any]:
     child = subprocess.Popen(command)
     while child.poll() is None:
         peak = max(peak, tree_pss(child.pid))
-        time.sleep(0.1)
+        time.sleep(0.25)
     wall = time.perf_counter() - start
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

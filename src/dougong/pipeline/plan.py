@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dougong.errors import InputError, OutputError
 from dougong.formats import FileInfo, describe
 from dougong.pipeline.memory import Room, estimated_bytes
@@ -148,8 +150,8 @@ def _planned(
 
 
 def _row_bytes(told: FileInfo) -> int:
-    """Return about how many bytes one record takes."""
-    return 8 + 4 * len(told.attributes)
+    """Return how many bytes one record takes at most: packed bits count as bytes."""
+    return sum(np.dtype(layout).itemsize for layout in told.attributes.values())
 
 
 def _out_bytes(files: Sequence[PlannedFile], full: bool) -> int:
