@@ -78,12 +78,40 @@ def test_a_registration_that_does_not_fit_is_refused(site, capsys, monkeypatch):
 
 
 def test_a_full_disk_is_refused_before_anything_is_read(site, capsys, monkeypatch):
-    usage = shutil.disk_usage(site)._replace(free=1000)
-    monkeypatch.setattr("dougong.pipeline.plan.shutil.disk_usage", lambda _: usage)
-    files = ["--lidar", str(site / "scan.laz"), "--photogrammetry", str(site / "drone.laz")]
-    assert call(["run", *files, "--out", str(site / "out"), "--memory", "4GB"]) == 1
+    _give_disk(monkeypatch, site, [1000])
+    assert call(_run_of(site)) == 1
     assert "free, and the run needs about" in capsys.readouterr().err
     assert not list(site.glob("out*"))
+
+
+def test_a_disk_that_only_the_upper_bound_does_not_fit_is_said_and_tried(site, capsys, monkeypatch):
+    _give_disk(monkeypatch, site, [200_000])
+    assert call(_run_of(site)) in (0, 3)
+    assert "less where the filters take much" in capsys.readouterr().err
+
+
+def test_a_disk_too_full_for_what_the_filters_left_is_refused_and_the_run_goes_on_later(
+    site, capsys, monkeypatch
+):
+    _give_disk(monkeypatch, site, [10**12, 1000])
+    assert call(_run_of(site)) == 1
+    assert "free, and what the filters left need about" in capsys.readouterr().err
+    assert not (site / "out").exists()
+    monkeypatch.undo()
+    assert call(_run_of(site)) in (0, 3)
+    assert "filtered in an earlier run; not filtered again" in capsys.readouterr().err
+
+
+def _run_of(site):
+    files = ["--lidar", str(site / "scan.laz"), "--photogrammetry", str(site / "drone.laz")]
+    return ["run", *files, "--out", str(site / "out"), "--memory", "4GB"]
+
+
+def _give_disk(monkeypatch, folder, free):
+    """Let the disk have so many bytes free, one number per time of asking, the last for good."""
+    usage, asked = shutil.disk_usage(folder), iter(free)
+    said = lambda _: usage._replace(free=next(asked, free[-1]))  # noqa: E731
+    monkeypatch.setattr("dougong.pipeline.refusals.shutil.disk_usage", said)
 
 
 def test_people_read_a_table(site, capsys):

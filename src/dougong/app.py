@@ -261,11 +261,10 @@ def run_project(
 
     `merge`, "best" or "all", takes the place of the project's ``merge.mode``.
     """
-    from dougong.pipeline.full_resolution import refuse_full_disk
     from dougong.pipeline.memory import Room
     from dougong.pipeline.outputs import refuse_existing, result_folder
-    from dougong.pipeline.plan import refuse_or_announce
     from dougong.pipeline.project import asked_project, files_of
+    from dougong.pipeline.refusals import refuse_full_disk, refuse_or_announce
     from dougong.pipeline.run import run
 
     out = _named(out)

@@ -1,13 +1,11 @@
 """``run --full-resolution``: every input file again, undecimated, in the frame of the reference."""
 
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dougong.cloud import Frame
-from dougong.errors import OutputError
 from dougong.formats import PlacedStation, Written, copy_file, is_same_crs, reissue, scans_in
 from dougong.pipeline.outputs import write_json
 from dougong.pipeline.progress import Progress
@@ -17,8 +15,6 @@ from dougong.pipeline.registrations import finite
 from dougong.typing import Transform
 
 FOLDER = "full"
-_ROOM = 1.1
-"""Part of the inputs' size that their new issue may need: LAZ of floats can be larger."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,28 +32,6 @@ class Place:
     """reference, ok, ambiguous or failed."""
     matrix: Transform | None
     """(4, 4) file coordinates to those of the reference; None: not sure enough to move it."""
-
-
-def refuse_full_disk(files: Sequence[Path], out: Path) -> None:
-    """Refuse a run whose files at full resolution do not fit the disk, before it starts.
-
-    Raises
-    ------
-    OutputError
-        They do not: the message says what is needed and what is free.
-    """
-    folder = out.absolute()
-    while not folder.exists():
-        folder = folder.parent
-    need = int(sum(file.stat().st_size for file in files) * _ROOM)
-    free = shutil.disk_usage(folder).free
-    if need > free:
-        msg = (
-            f"the clouds at full resolution need about {need / 1e9:.3g} GB, and {free / 1e9:.3g} "
-            f"GB are free at {folder}. Free some space, choose another --out, or leave "
-            "--full-resolution out."
-        )
-        raise OutputError(msg)
 
 
 def output_names(files: Sequence[tuple[str, Path]]) -> list[str]:

@@ -4,7 +4,6 @@ Nothing is decoded but what counting needs. The numbers are upper bounds or roug
 the voxel grid leaves is known only once it ran.
 """
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,20 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from dougong.errors import InputError, OutputError
 from dougong.formats import FileInfo, describe
 from dougong.pipeline.memory import Room, estimated_bytes
-from dougong.pipeline.plan_stages import PlannedFile, PlannedStage, Way, planned_stages
-from dougong.pipeline.progress import Progress
+from dougong.pipeline.plan_stages import (
+    PlannedFile,
+    PlannedStage,
+    Way,
+    planned_stages,
+    surely_kept,
+)
 from dougong.pipeline.project import Entry, Project, files_of
 from dougong.threads import get_threads
 
 _PARALLEL = 0.8
 """Share of that work which threads divide."""
 
-LONG_SECONDS = 120.0
-"""A run that may take longer is announced with its plan."""
-_QUICK_BYTES = 100_000_000
 _OUT_BYTES_PER_POINT = 12
 """Of compressed points with colour; every kept point is written twice (its cloud, merged)."""
 
@@ -44,6 +44,8 @@ class Plan:
     """What ``--memory`` allows, or four fifths of what is free; None: unknown."""
     work_bytes: int
     """Temporary, at most."""
+    sure_work_bytes: int
+    """Temporary, at least: as if nothing were left of the scans and half of the drone clouds."""
     out_bytes: int
     """Of the result, at most: as if the filters took nothing."""
     seconds: float
@@ -95,6 +97,7 @@ def plan_run(
             refusals += [refusal] if refusal else []
     full = project.project.full_resolution
     stages = planned_stages(files, row_bytes, room, full=full)
+    surely = planned_stages(files, row_bytes, room, full=full, kept=surely_kept)
     most = max(stages, key=lambda stage: stage.memory_bytes)
     if room.is_asked and most.memory_bytes > room.bytes:
         refusals.append(
@@ -108,6 +111,7 @@ def plan_run(
         memory_bytes=max(stage.memory_bytes for stage in stages),
         memory_limit_bytes=None if room.bytes == float("inf") else int(room.bytes),
         work_bytes=max(stage.work_bytes for stage in stages),
+        sure_work_bytes=max(stage.work_bytes for stage in surely),
         out_bytes=_out_bytes(files, full),
         seconds=_wall(sum(stage.seconds for stage in stages)),
         refusal=refusals[0] if refusals else None,
@@ -161,45 +165,3 @@ def _out_bytes(files: Sequence[PlannedFile], full: bool) -> int:
 
 def _wall(cpu_seconds: float) -> float:
     return cpu_seconds * (1.0 - _PARALLEL + _PARALLEL / get_threads())
-
-
-def refuse_full_work_disk(plan: Plan, work: Path) -> None:
-    """Refuse a run for which the disk has no room, before it starts.
-
-    Raises
-    ------
-    OutputError
-        The disk of `work` has less free than what is written meanwhile takes, or than half of the
-        upper bound of that and the result, which lies beside it as a rule and is compressed.
-    """
-    need = max(plan.work_bytes, (plan.work_bytes + plan.out_bytes) // 2)
-    folder = next(path for path in (work, *work.absolute().parents) if path.is_dir())
-    free = shutil.disk_usage(folder).free
-    if need > free:
-        msg = (
-            f"{folder} has {free / 1e9:.1f} GB free, and the run needs about {need / 1e9:.1f} GB. "
-            "Free some space or pass another --work."
-        )
-        raise OutputError(msg)
-
-
-def refuse_or_announce(
-    project: Project, folder: Path, room: Room, work: Path, progress: Progress
-) -> None:
-    """Plan a run whose files are many bytes: refuse what cannot be, say what takes long.
-
-    Raises
-    ------
-    InputError, OutputError
-        It needs more memory than the user allows, or more disk than there is.
-    """
-    files = [file for entry in project.cloud for file in files_of(entry, folder)]
-    size = sum(file.stat().st_size for file in files if file.is_file())
-    if not room.is_asked and size < _QUICK_BYTES:
-        return  # counting the points of some formats takes a pass over them
-    plan = plan_run(project, folder, room)
-    if plan.refusal is not None:
-        raise InputError(plan.refusal)
-    refuse_full_work_disk(plan, work)
-    if plan.seconds > LONG_SECONDS:
-        progress.note(plan.in_words())

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from dougong.pipeline.memory import (
@@ -45,7 +45,7 @@ class PlannedFile:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedStage:
-    """One stage of a run, as if the filters took nothing."""
+    """One stage of a run."""
 
     name: str
     tiles: int
@@ -57,8 +57,23 @@ class PlannedStage:
     """CPU seconds."""
 
 
+def every_point(file: PlannedFile) -> int:
+    """Return the points that the filters leave at most."""
+    return file.points
+
+
+def surely_kept(file: PlannedFile) -> int:
+    """Return the points that the filters leave at least: a voxel grid may take nearly all."""
+    return 0 if file.kind == "lidar" else file.points // 2
+
+
 def planned_stages(
-    files: Sequence[PlannedFile], row_bytes: Mapping[str, int], room: Room, *, full: bool
+    files: Sequence[PlannedFile],
+    row_bytes: Mapping[str, int],
+    room: Room,
+    *,
+    full: bool,
+    kept: Callable[[PlannedFile], int] = every_point,
 ) -> tuple[PlannedStage, ...]:
     """Return the stages of a run in order.
 
@@ -70,16 +85,19 @@ def planned_stages(
     room : Room
     full : bool
         Every file is written again at full resolution.
+    kept : callable
+        Returns how many points the filters leave of a file.
     """
     stages: list[PlannedStage] = []
+    left = [replace(file, points=kept(file)) for file in files]
     waiting = kept_bytes = 0
-    for file in files:
+    for file, after in zip(files, left, strict=True):
         stages.append(_filter_stage(file, row_bytes[file.path], waiting, kept_bytes))
         if file.way == "on tiles":
-            kept_bytes += file.points * (row_bytes[file.path] + _SPOOL_ROW_BYTES)
+            kept_bytes += after.points * (row_bytes[file.path] + _SPOOL_ROW_BYTES)
         else:
             waiting += file.points
-    return (*stages, *_later_stages(files, row_bytes, room, kept_bytes, full=full))
+    return (*stages, *stages_after(left, row_bytes, room, kept_bytes, full=full))
 
 
 def _filter_stage(file: PlannedFile, row: int, waiting: int, kept_bytes: int) -> PlannedStage:
@@ -109,7 +127,7 @@ def _tiles(points: int, most: int) -> int:
     return max(1, -(-points * HALO_SHARE // most))
 
 
-def _later_stages(
+def stages_after(
     files: Sequence[PlannedFile],
     row_bytes: Mapping[str, int],
     room: Room,
@@ -117,6 +135,7 @@ def _later_stages(
     *,
     full: bool,
 ) -> list[PlannedStage]:
+    """Return the stages behind the filters, which left `files` of `kept_bytes` on disk."""
     held = [file.points for file in files if file.way != "on tiles"]
     points = sum(file.points for file in files)
     records = sum(file.points * row_bytes[file.path] for file in files)

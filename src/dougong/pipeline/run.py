@@ -23,6 +23,7 @@ from dougong.pipeline.outputs import scratch_folder, write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Project
 from dougong.pipeline.provenance import Clock, peak_memory_bytes, software
+from dougong.pipeline.refusals import refuse_full_disk_after_filters
 from dougong.pipeline.registrations import finite
 from dougong.pipeline.result_hash import result_hash
 from dougong.pipeline.run_document import (
@@ -95,6 +96,9 @@ def _result(project: Project, loader: Loader, out: Path) -> dict[str, Any]:
     clock, progress = loader.clock, loader.progress
     control = control_of_project(project, loader.folder)
     movers = load_all(project, loader, control)
+    refuse_full_disk_after_filters(
+        movers, loader.room, loader.scratch, full=project.project.full_resolution
+    )
     reference = next(mover for mover in movers if mover.entry == project.reference())
     found = _registered(project, loader, movers, reference, control)
     linked, hold = found.linked, loader.hold()
