@@ -21,7 +21,8 @@ from dougong.evaluation.object_methods import METHODS
 
 COLUMNS = (
     *("level", "motion", "method", "shapes", "pairs", "ok", "ambiguous", "precision", "recall"),
-    *("precision_symmetric", "recall_symmetric", "rre_mean_deg", "rre_median_deg"),
+    *("precision_symmetric", "recall_symmetric", "wrong", "wrong_symmetric"),
+    *("rre_deg_mean", "rre_deg_median", "rre_symmetric_deg_mean", "rre_symmetric_deg_median"),
     *("rre_ok_mean_deg", "rte_median", "seconds_median"),
 )
 

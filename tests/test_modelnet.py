@@ -7,14 +7,13 @@ from scipy.spatial.transform import Rotation
 from dougong.evaluation.modelnet import (
     Ladder,
     Trial,
-    describe_shape,
-    is_symmetry,
     make_pair,
     random_motion,
     run_ladder,
     summarise,
 )
 from dougong.evaluation.object_methods import METHODS
+from dougong.evaluation.object_symmetry import describe_shape, is_symmetry, symmetric_error
 from dougong.registration import FreeRotation
 from object_shapes import bar, chair, moved
 
@@ -29,6 +28,17 @@ def test_symmetries_of_a_square_bar(square):
     for T in square.symmetries:
         assert np.abs(T[:3, :3] - np.round(T[:3, :3])).max() < 0.03
         assert np.linalg.norm(T[:3, 3]) < 0.05
+
+
+def test_an_equal_pose_is_as_far_as_the_nearest_one_that_a_symmetry_makes_true(square):
+    quarter, tilt = (Rotation.from_euler(a, d, degrees=True) for a, d in (("z", 90.0), ("x", 4.0)))
+    truth, found = np.eye(4), np.eye(4)
+    truth[:3, :3] = Rotation.from_euler("xyz", (10.0, 20.0, 30.0), degrees=True).as_matrix()
+    truth[:3, 3] = 0.1, 0.2, 0.3
+    found[:3, :3] = (tilt * quarter).as_matrix()
+    angle, shift = symmetric_error(truth @ found, truth, square)
+    assert angle == pytest.approx(4.0, abs=0.5)
+    assert shift < 0.02
 
 
 def test_a_lopsided_chair_has_none():
@@ -108,6 +118,8 @@ def test_precision_and_recall_by_hand():
             has_symmetry=True,
             rre_deg=1.0,
             rte=0.0,
+            rre_symmetric_deg=1.0,
+            rte_symmetric=0.0,
             seconds=1.0,
             is_correct=correct,
             is_correct_symmetric=like,

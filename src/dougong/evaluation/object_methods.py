@@ -14,6 +14,9 @@ from dougong.registration.pose_search import Poses, build_field, poses_of
 from dougong.registration.sample_consensus import SacIa, consensus_poses
 from dougong.typing import Points, Values
 
+TOLD = "ours-told"
+"""Ours with the largest rotation known, as learned methods know it: the ladder tells it."""
+
 
 def _axes(points: Points) -> NDArray[np.float64]:
     vectors: NDArray[np.float64] = np.linalg.eigh(points.T @ points)[1][:, ::-1].copy()
@@ -76,6 +79,7 @@ def _ours(pair: ObjectPair, settings: FreeRotation) -> Poses:
 
 METHODS: Mapping[str, Callable[[ObjectPair, FreeRotation], Poses]] = {
     "ours": _ours,
+    TOLD: _ours,
     "improved-pca": _improved_pca,
     "pca": _pca,
     "sac-ia": _sac_ia,
