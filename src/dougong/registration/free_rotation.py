@@ -21,6 +21,7 @@ from dougong._checks import as_points
 from dougong.errors import RegistrationError
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid
 from dougong.params import Parameters
+from dougong.registration import object_evidence as evidence
 from dougong.registration import object_fit as fitting
 from dougong.registration.pose_search import (
     Field,
@@ -91,7 +92,7 @@ class ObjectRegistration:
     """Share of source points that the pose lays on a like surface of the target."""
     explained_target: float
     sigma_m: float
-    """Robust spread of the plane distances at the best pose."""
+    """Robust spread of the plane distances where the clouds fit best."""
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -281,10 +282,10 @@ def _grid_poses(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Judged:
-    best: fitting.Testimony
-    rivals: tuple[fitting.Testimony, ...]
+    best: evidence.Testimony
+    rivals: tuple[evidence.Testimony, ...]
     """Not told apart from the best."""
-    others: tuple[fitting.Testimony, ...]
+    others: tuple[evidence.Testimony, ...]
     sigma_m: float
     sharpness: float
 
@@ -296,24 +297,23 @@ def _judge(views: tuple[View, View], poses: Poses, params: FreeRotation) -> _Jud
     reaches = (max(0.1 * radius, 3.0 * spacing), 2.5 * spacing)
     refined = [fitting.fit(source, target, _matrix(pose), reaches, iterations=12) for pose in poses]
     gap = 1.5 * spacing
-    blind = [fitting.blind_loss(source, target, T, 2.0 * spacing, gap) for T in refined]
-    sigma = fitting.noise_of(source, target, refined[int(np.argmin(blind))], 2.0 * spacing)
+    sigma = evidence.noise_of(source, target, refined, 2.0 * spacing)
     tolerance = max(sigma, 0.02 * spacing)
     heard = sorted(
-        (fitting.hear(source, target, T, tolerance, gap) for T in refined), key=lambda h: h.total
+        (evidence.hear(source, target, T, tolerance, gap) for T in refined), key=lambda h: h.total
     )
-    kept: list[fitting.Testimony] = []
+    kept: list[evidence.Testimony] = []
     for one in heard:
         if not any(fitting.near(one.T, k.T, SAME_DEG, SAME_RADII * radius) for k in kept):
             kept.append(one)
-    block, blocks = fitting.blocks_of(views[0], views[1], _BLOCKS_PER_SIDE)
-    is_beaten = [fitting.is_worse(kept[0], k, block, blocks, params.sigmas) for k in kept[1:]]
+    block, blocks = evidence.blocks_of(views[0], views[1], _BLOCKS_PER_SIDE)
+    is_beaten = [evidence.is_worse(kept[0], k, block, blocks, params.sigmas) for k in kept[1:]]
     return _Judged(
         best=kept[0],
         rivals=tuple(k for k, beaten in zip(kept[1:], is_beaten, strict=True) if not beaten),
         others=tuple(k for k, beaten in zip(kept[1:], is_beaten, strict=True) if beaten),
         sigma_m=sigma,
-        sharpness=fitting.sharpness(source, target, kept[0], tolerance, gap),
+        sharpness=evidence.sharpness(source, target, kept[0], tolerance, gap),
     )
 
 
@@ -332,7 +332,7 @@ def _answer(pair: ObjectPair, judged: _Judged, params: FreeRotation) -> ObjectRe
     listed = tuple(
         Hypothesis(
             T_target_source=T if k == 0 else to_transform(_flat(h.T), views[0], views[1]),
-            score=1.0 - h.total,
+            score=h.explained,
             method="free-rotation",
         )
         for k, h in enumerate((best, *judged.rivals, *judged.others))
