@@ -6,14 +6,15 @@ import hashlib
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from dougong import threads
 from dougong.errors import InputError
 from dougong.evaluation import scenes, survey
 from dougong.evaluation.drone import Drone, draw_bending
-from dougong.evaluation.mesh import MIXED, NEAR_NOISE, OUTLIER, Mesh
+from dougong.evaluation.mesh import MIXED, NEAR_NOISE, OUTLIER, Mesh, Tracer
 from dougong.evaluation.metrics import displacements, pose_errors
-from dougong.evaluation.scanner import Scanner
+from dougong.evaluation.scanner import Scanner, scan
 from dougong.evaluation.solids import box, join
 
 KINDS = sorted(scenes.BUILDERS)
@@ -292,6 +293,26 @@ def test_range_offset_moves_points_along_the_beam(clean):
         axis=1,
     )
     np.testing.assert_allclose(moved, 0.05, atol=1e-9)
+
+
+def test_what_the_compensator_leaves_tilts_each_station_by_itself():
+    tracer = Tracer(world_of("wall", 1)[0].during_scan)
+    stations = np.array([[0.0, -12.0, 2.0], [6.0, -15.0, 2.0]])
+    quick = CLEAN_SCANNER.model_copy(update={"points": 3000, "outliers": 0.0})
+    plain = scan(tracer, stations, quick, np.random.default_rng(0))
+    spoilt = quick.model_copy(update={"compensator_error_deg": 0.05})
+    tilted = scan(tracer, stations, spoilt, np.random.default_rng(0))
+    turns = []
+    for number, place in enumerate(stations):
+        before, after = ((found.xyz - place)[found.sensor == number] for found in (plain, tilted))
+        np.testing.assert_allclose(
+            np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1), atol=1e-9
+        )
+        turn, _ = Rotation.align_vectors(after, before)
+        np.testing.assert_allclose(turn.apply(before), after, atol=1e-7)
+        turns.append(turn.as_rotvec(degrees=True))
+    assert np.abs(turns)[:, 2].max() < 1e-6
+    assert 1e-3 < np.abs(np.subtract(*turns)).max() < 0.3
 
 
 def test_unknown_kind_is_refused():

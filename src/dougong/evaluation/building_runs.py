@@ -24,9 +24,9 @@ from dougong.registration.checks import level_of
 
 DRONE_SHARE = 0.6
 """Points of a drone's cloud / points of the scanner's."""
-SYSTEMATIC = Scanner(range_offset_m=0.002, angle_noise_deg=0.004)
-"""A scanner with a wrong instrument constant and twice the angular noise; the other scanner of its
-pair has the constant with the other sign."""
+SYSTEMATIC = Scanner(range_offset_m=0.002, angle_noise_deg=0.004, compensator_error_deg=0.002)
+"""A scanner with a wrong instrument constant, twice the angular noise and 7 arc seconds of tilt
+left at each station; the other scanner of its pair has the constant with the other sign."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +55,7 @@ def by_scanner(kind: str, seed: int, points: int) -> Surveyed:
 
 
 def by_faulty_scanners(kind: str, seed: int, points: int) -> Surveyed:
-    """Scan a building twice, by instruments whose ranges are off, one long and one short."""
+    """Scan a building twice, by instruments out of adjustment whose ranges are long and short."""
     other = SYSTEMATIC.model_copy(update={"range_offset_m": -SYSTEMATIC.range_offset_m})
     long, short = (_base(kind, seed, points, scanner) for scanner in (SYSTEMATIC, other))
     even, odd = long.station % 2 == 0, short.station % 2 == 1
@@ -89,7 +89,7 @@ def _scanned(base: Base, seed: int) -> Surveyed:
 PAIRS: Mapping[str, Callable[[str, int, int], Surveyed]] = {
     "scanner and drone": by_drone,
     "two scanners": by_scanner,
-    "two scanners with range offset": by_faulty_scanners,
+    "two scanners out of adjustment": by_faulty_scanners,
 }
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
 from dougong.evaluation.mesh import MIXED, NEAR_NOISE, OUTLIER, REFLECTANCES, Bytes, Tracer
 from dougong.params import Parameters
@@ -24,6 +25,8 @@ class Scanner(Parameters):
     """Added to every range (a wrong instrument constant)."""
     angle_noise_deg: Annotated[float, Field(ge=0)] = 0.002
     """Standard deviation of one angle, horizontal and vertical."""
+    compensator_error_deg: Annotated[float, Field(ge=0)] = 0.0
+    """Standard deviation of what the compensator leaves of a station's tilt about x and about y."""
     max_range_m: Annotated[float, Field(gt=0)] = 120.0
     """Nothing farther returns."""
     max_incidence_deg: Annotated[float, Field(gt=0, le=90)] = 86.0
@@ -60,6 +63,10 @@ def scan(tracer: Tracer, stations: Points, params: Scanner, rng: np.random.Gener
     parts = [
         _returns(tracer, place, number, step, params, rng) for number, place in enumerate(stations)
     ]
+    if params.compensator_error_deg > 0:
+        parts = [
+            _tilted(part, place, params, rng) for part, place in zip(parts, stations, strict=True)
+        ]
     merged = Returns(
         xyz=np.concatenate([part.xyz for part in parts]),
         labels=np.concatenate([part.labels for part in parts]),
@@ -68,6 +75,13 @@ def scan(tracer: Tracer, stations: Points, params: Scanner, rng: np.random.Gener
         face=np.concatenate([part.face for part in parts]),
     )
     return with_outliers(merged, stations, params.outliers, rng)
+
+
+def _tilted(part: Returns, place: Points, params: Scanner, rng: np.random.Generator) -> Returns:
+    """Return a station's points turned about x and y by what its compensator did not see."""
+    tilt = np.radians(rng.normal(0.0, params.compensator_error_deg, 2))
+    turn = Rotation.from_rotvec([*tilt, 0.0]).as_matrix()
+    return replace(part, xyz=place + (part.xyz - place) @ turn.T)
 
 
 def _directions(step_deg: float, params: Scanner, rng: np.random.Generator) -> Points:
