@@ -7,7 +7,7 @@ import pytest
 
 from dougong.evaluation import denoise, denoise_noise, denoise_real
 from dougong.evaluation.denoise_shapes import SHAPES
-from dougong.evaluation.mesh import FINE, SURFACE, VEGETATION, Tracer
+from dougong.evaluation.mesh import FINE, SURFACE, VEGETATION, Tracer, join
 from dougong.evaluation.solids import block
 
 
@@ -154,3 +154,19 @@ def test_real_clouds_keep_their_points_and_know_their_noise():
     assert not given.is_separable[~given.is_noise].any()
     again = denoise_real.sample_of("plate", points, 3)
     np.testing.assert_array_equal(given.points, again.points)
+
+
+def test_a_scanned_building_has_noise_of_every_kind_and_fine_points_where_it_is_curved():
+    mesh = join([block((0, 0, 0), (6.0, 3.0, 3.0)), block((2.0, -2.0, 0), (0.1, 0.1, 3.2)),
+                 block((90.0, 0, 0), (4.0, 4.0, 2.0))])  # fmt: skip
+    building = denoise_real.Building("house", "house.ply", False, 300.0, 20.0)
+    given = denoise_real.scanned(building, mesh, 1)
+    assert set(denoise_noise.NOISE_KINDS) <= set(given.labels.tolist())
+    clean = given.points[~given.is_noise]
+    # The neighbour 90 m away was left out, and what is seen is the front.
+    assert clean[:, 0].max() < 10
+    assert np.percentile(clean[:, 1], 95) < 0.1
+    assert (given.labels == FINE).sum() == pytest.approx(0.25 * len(clean), rel=0.01)
+    is_post = np.abs(clean[:, :2] - (2.0, -2.0)).max(axis=1) < 0.08
+    on_post = given.labels[~given.is_noise][is_post] == FINE
+    assert on_post.mean() > 0.8
