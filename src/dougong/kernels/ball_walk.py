@@ -10,6 +10,7 @@ import numpy as np
 
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel
+from dougong.kernels.boxtree import points_under
 
 SHARE = 2
 """Leaves whose points share an answer; a power of two, as is `_GROUP`."""
@@ -48,10 +49,8 @@ def make_walk(leaves: int) -> Walk:
 @kernel
 def size_of(node: int, n: int) -> int:
     """Return how many of n points lie under `node`."""
-    level = 1
-    while 2 * level <= node:
-        level *= 2
-    return (node - level + 1) * n // level - (node - level) * n // level
+    first, last = points_under(node, n)
+    return last - first
 
 
 @kernel

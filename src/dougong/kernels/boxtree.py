@@ -73,6 +73,15 @@ def _fill_box(points: Floats, first: int, last: int, boxes: Floats, node: int) -
 
 
 @kernel
+def points_under(node: int, n: int) -> tuple[int, int]:
+    """Return which of n points, first .. last - 1 of the order, lie under `node`."""
+    level = 1
+    while 2 * level <= node:
+        level *= 2
+    return (node - level) * n // level, (node - level + 1) * n // level
+
+
+@kernel
 def split(points: Floats, places: Ints, boxes: Floats, root: int, below: int) -> None:
     """Order points and places (n,) under node `root` by halving at medians along longest sides.
 
@@ -87,11 +96,7 @@ def split(points: Floats, places: Ints, boxes: Floats, root: int, below: int) ->
     while height > 0:
         height -= 1
         node = stack[height]
-        level = 1
-        while 2 * level <= node:
-            level *= 2
-        first = (node - level) * n // level
-        last = (node - level + 1) * n // level
+        first, last = points_under(node, n)
         _fill_box(points, first, last, boxes, node)
         if node >= leaves:
             continue
@@ -102,7 +107,8 @@ def split(points: Floats, places: Ints, boxes: Floats, root: int, below: int) ->
                 > boxes[node, 3 + axis] - boxes[node, axis]
             ):
                 axis = other
-        _select(points, places, first, last, (2 * (node - level) + 1) * n // (2 * level), axis)
+        _, middle = points_under(2 * node, n)
+        _select(points, places, first, last, middle, axis)
         if 2 * node < below:
             stack[height] = 2 * node + 1
             stack[height + 1] = 2 * node

@@ -10,7 +10,12 @@ import numpy as np
 
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel
-from dougong.kernels.boxtree import box_distance2, box_far_distance2, comes_first
+from dougong.kernels.boxtree import (
+    box_distance2,
+    box_far_distance2,
+    comes_first,
+    points_under,
+)
 from dougong.kernels.disjoint import join, root_of
 
 _DEPTH = 64
@@ -19,11 +24,8 @@ _DEPTH = 64
 @kernel
 def node_ends(n: int, ends: Ints) -> None:
     """Fill ends (2 leaves,): one past the last of n points under each node."""
-    level = 1
     for node in range(1, ends.shape[0]):
-        if node >= 2 * level:
-            level *= 2
-        ends[node] = (node - level + 1) * n // level
+        _, ends[node] = points_under(node, n)
 
 
 @kernel
@@ -47,7 +49,7 @@ def _refresh(parent: Ints, ends: Ints, label: Ints) -> None:
 
 
 @kernel
-def _join_small_nodes(boxes: Floats, ends: Ints, least2: float, parent: Ints) -> None:
+def _join_small_nodes(boxes: Floats, least2: float, parent: Ints) -> None:
     """Join all points of nodes whose box has a squared diagonal of at most `least2`."""
     n = parent.shape[0]
     leaves = boxes.shape[0] // 2
@@ -61,11 +63,8 @@ def _join_small_nodes(boxes: Floats, ends: Ints, least2: float, parent: Ints) ->
         for axis in range(3):
             diagonal2 += (boxes[node, 3 + axis] - boxes[node, axis]) ** 2
         if diagonal2 <= least2:
-            level = 1
-            while 2 * level <= node:
-                level *= 2
-            first = (node - level) * n // level
-            for i in range(first + 1, ends[node]):
+            first, last = points_under(node, n)
+            for i in range(first + 1, last):
                 join(parent, first, i)
         elif node < leaves:
             stack[height] = 2 * node
@@ -85,7 +84,7 @@ def link_within(points: Floats, boxes: Floats, gap: Floats, least: float, parent
     ends = np.zeros(2 * leaves, np.int64)
     node_ends(n, ends)
     # A hair less than the rounding of a diagonal.
-    _join_small_nodes(boxes, ends, least * least * (1.0 - 1e-12), parent)
+    _join_small_nodes(boxes, least * least * (1.0 - 1e-12), parent)
     label = np.full(2 * leaves, -1, np.int64)
     stack = np.empty(_DEPTH, np.int64)
     again = max(n // 16, 1024)

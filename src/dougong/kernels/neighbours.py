@@ -8,7 +8,12 @@ import numpy as np
 
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel
-from dougong.kernels.boxtree import box_distance2, box_far_distance2, comes_first
+from dougong.kernels.boxtree import (
+    box_distance2,
+    box_far_distance2,
+    comes_first,
+    points_under,
+)
 
 _DEPTH = 64
 
@@ -226,12 +231,7 @@ def count_within(points: Floats, boxes: Floats, queries: Floats, radius2: float,
             node = stack[height]
             if box_distance2(boxes, node, x, y, z) > radius2:
                 continue
-            first, last = node, node + 1
-            while first < leaves:
-                first *= 2
-                last *= 2
-            first = (first - leaves) * n // leaves
-            last = (last - leaves) * n // leaves
+            first, last = points_under(node, n)
             if box_far_distance2(boxes, node, x, y, z) <= radius2:
                 total += last - first
             elif node < leaves:
@@ -282,10 +282,8 @@ def sum_distances(
                 boxes[node, 1] == boxes[node, 4] and boxes[node, 2] == boxes[node, 5]
             ):
                 # A heap of duplicates counts as one: all are equally far.
-                level = 1
-                while 2 * level <= node:
-                    level *= 2
-                copies = (node - level + 1) * n // level - (node - level) * n // level
+                first, last = points_under(node, n)
+                copies = last - first
                 count += copies
                 total += copies * int(np.sqrt(near2) * steps_per_m + 0.5)
                 continue
