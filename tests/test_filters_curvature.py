@@ -227,6 +227,37 @@ def test_protective_is_its_twin_in_any_order(seed, n):
         np.testing.assert_array_equal(again.attributes[name], values[shuffle])
 
 
+def chain(links, at, seed=2):
+    """Return a hanging chain: rings of 60 points, a centimetre or two from one to the next."""
+    rng = np.random.default_rng(seed)
+    turn, tube = rng.uniform(0, 2 * np.pi, (2, links, 60))
+    out = 0.04 + 0.005 * np.cos(tube)
+    ring = np.stack([out * np.cos(turn), 0.005 * np.sin(tube), out * np.sin(turn)], axis=2)
+    ring[1::2] = ring[1::2][:, :, [1, 0, 2]]
+    ring[:, :, 2] += 0.06 * np.arange(links)[:, None]
+    return ring.reshape(-1, 3) + at
+
+
+def test_protective_with_pieces_of_one_thing_is_its_twin():
+    links, clumps = chain(4, [1.0, -0.5, 1.0]), np.random.default_rng(1).normal(0, 0.01, (2, 12, 3))
+    clumps += np.array([[0.2, -0.6, 0.5], [1.8, -0.8, 1.5]])[:, None]
+    points = np.vstack([wall(250, 4, 2.0), links, *clumps])
+    margin = curvature_weighted(points, PROTECTIVE).attributes["removal_margin"]
+    limits = protective.distance_limits(PROTECTIVE.surface_loss)
+    expected, _ = slow.judge(points, PROTECTIVE.alpha, PROTECTIVE.gamma, limits, protective)
+    np.testing.assert_allclose(np.minimum(margin, 1e3), np.minimum(expected, 1e3), rtol=2e-3)
+
+
+def test_protective_keeps_a_hanging_chain_and_takes_the_birds_beside_it():
+    rng = np.random.default_rng(8)
+    birds = rng.uniform([0.3, -2.5, 1], [3.7, -1, 3], (8, 1, 3)) + rng.normal(0, 0.03, (8, 60, 3))
+    links = chain(20, [2.0, -0.5, 1.0])
+    given = np.vstack([wall(16 * 900, 2), links, birds.reshape(-1, 3)])
+    is_kept = curvature_weighted(given, PROTECTIVE).is_kept[16 * 900 :]
+    assert is_kept[: len(links)].mean() > 0.95
+    assert not is_kept[len(links) :].any()
+
+
 def test_protective_needs_no_more_of_the_cloud_than_its_halo():
     points, _ = bracketed_facade(120.0, 0.03, 4)
     points = on_lattice(points)

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.stats import binom
 
 from dougong.filters import local_spacing
+from dougong.filters.groups import BETWEEN, GROUP, LINK, MANY, PIECE
 from reference.filters import distances
 
 
@@ -65,6 +66,27 @@ def groups(links, n):
     return group
 
 
+def pieces_joined(group, points, usual, table, reach):
+    """Return the group number (n,) after pieces of one thing became one group."""
+    members = {g: group == g for g in set(group.tolist())}
+    size = {
+        g: max(usual[m].mean() * math.sqrt(m.sum()), np.ptp(points[m], axis=0).max())
+        for g, m in members.items()
+    }
+    pieces = [
+        g
+        for g, m in members.items()
+        if PIECE < m.sum() < MANY and np.ptp(points[m], axis=0).max() <= GROUP * reach
+    ]
+    joined = group.copy()
+    for a in pieces:
+        for b in pieces:
+            gap = table[np.ix_(members[a], members[b])].min()
+            if a < b and gap <= BETWEEN * min(size[a], size[b]):
+                joined[joined == joined[members[b]][0]] = joined[members[a]][0]
+    return joined
+
+
 def in_row(points, spacing, rule, radius):
     """Return the logarithm (n,) of how many such rows chance makes, at most 0."""
     n, table = len(points), distances(points)
@@ -99,7 +121,7 @@ def in_row(points, spacing, rule, radius):
 
 
 def judge(points, alpha, gamma, limits, rule, reach=0.5):
-    """Return margin (n,) and spacing (n,); `rule` is the module that holds the constants."""
+    """Return margin (n,) and spacing (n,); `rule` holds the constants."""
     n, table = len(points), distances(points)
     order = np.argsort(table, axis=1, kind="stable")
     ranked = np.sort(table, axis=1)
@@ -116,26 +138,29 @@ def judge(points, alpha, gamma, limits, rule, reach=0.5):
         for j in near[i]:
             part = axes[j].T @ (points[i] - points[j])
             reached.append(np.linalg.norm(part / (1.0, divisors[j, 0], divisors[j, 1])) / usual[j])
-            if np.linalg.norm(part / (1, 1, divisors[j, 2])) <= rule.LINK * max(usual[i], usual[j]):
+            if np.linalg.norm(part / (1, 1, divisors[j, 2])) <= LINK * max(usual[i], usual[j]):
                 links.append((i, j))
         if len(reached) >= rule.TESTS:
             margin[i] = (np.sort(reached)[: rule.TESTS] / limits).max()
-    group = groups(links, n)
+    group = pieces_joined(groups(links, n), points, usual, table, reach)
     extent = {g: np.ptp(points[group == g], axis=0).max() for g in set(group.tolist())}
     held = {g: (group == g).sum() for g in extent}
-    is_large = {g: extent[g] > rule.GROUP * reach or held[g] >= rule.MANY for g in extent}
+    is_large = {g: extent[g] > GROUP * reach or held[g] >= MANY for g in extent}
     large = np.array([is_large[g] for g in group])
     for g in set(group.tolist()):
         mine = group == g
         if is_large[g]:
             continue
-        gap = min(rule.GROUP * reach, table[np.ix_(mine, large)].min() if large.any() else np.inf)
+        gap = min(GROUP * reach, table[np.ix_(mine, large)].min() if large.any() else np.inf)
         size = max(usual[mine].mean() * math.sqrt(mine.sum()), extent[g])
         margin[mine] = np.maximum(margin[mine], gap / size)
     gone = np.flatnonzero(margin > 1)
     if len(gone):
         log = in_row(
-            points[gone], np.minimum(usual[gone], rule.ROW_REACH * reach), rule, rule.GROUP * reach
+            points[gone],
+            np.minimum(usual[gone], rule.ROW_REACH * reach),
+            rule,
+            GROUP * reach,
         )
         sure = gone[log < 0]
         excused = math.log(rule.ROW_ACCIDENTS) / log[log < 0]

@@ -15,6 +15,7 @@ from dougong.errors import InputError
 from dougong.filters import protective
 from dougong.filters.balls import BLUR, Balls, CellBalls, ExactBalls, Lattice, build_lattice
 from dougong.filters.concentration import concentration_note
+from dougong.filters.groups import Groups
 from dougong.filters.selection import Selection
 from dougong.filters.totals import Totals
 from dougong.params import Parameters
@@ -254,7 +255,7 @@ def judge_protective(
     p: CurvatureWeighted,
     voxel_count: ArrayLike | None,
     whole: protective.Whole | None,
-) -> tuple[Selection, protective.Groups]:
+) -> tuple[Selection, Groups]:
     """Return the choice of rule ``protective`` and what groups the points' own ones are in."""
     verdict = protective.judge(points, p.alpha, p.gamma, p.surface_loss, p.reach_m, whole)
     is_kept = verdict.reason == protective.Taken.KEPT

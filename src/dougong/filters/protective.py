@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dougong.filters.local_spacing import FAR_CELLS, SMALLEST_M, STEPS, local_spacing
+from dougong.filters.groups import GROUP, LINK, MANY, Groups, group_margin
+from dougong.filters.local_spacing import FAR_CELLS, SMALLEST_M, local_spacing
 from dougong.filters.ranks import ValueBlocks, at_rank
 from dougong.threads import for_blocks
 from dougong.typing import Values
@@ -34,12 +35,6 @@ REACH_M = 0.5
 SPARSE, DENSE = 5.0, 50.0
 """Median spacings that the reach must hold, and may hold before it is halved: 0.5 m serves from
 100 to 10,000 points/m2. In a longer reach scattered noise would have a spacing of its own."""
-LINK = 2.0
-"""Points within this many spacings make a group: an even surface holds together from 1.2 on."""
-GROUP = 2.0
-"""A group that extends farther than this many reaches is large; a wider gap is taken as this."""
-MANY = 1000
-"""A group of so many points is large: whatever it is, it was scanned, not stirred up."""
 ROW_NEIGHBOURS, ROW_WIDTH, ROW_ACCIDENTS = 24, 0.5, 1e-3
 """A point stays if, among this many nearest of those that would go, a row (this many spacings to
 either side) has so many that chance would make fewer than this number of such rows there."""
@@ -67,19 +62,11 @@ class Whole(NamedTuple):
 
     reach_m: float
     many: int = MANY
-    """Groups of so many points are large (`is_whole` of `_group_margin`)."""
+    """Groups of so many points are large (`is_whole` of `group_margin`)."""
     is_few: bool = False
     """So few points that they have no surroundings to be judged by."""
     own: int = 0
     """The first so many of the points are the part's own, the others its halo."""
-
-
-class Groups(NamedTuple):
-    """What was found of the groups that own points belong to."""
-
-    has_large: bool
-    most: int
-    """Points of the one with most points."""
 
 
 class Verdict(NamedTuple):
@@ -97,7 +84,7 @@ class Verdict(NamedTuple):
 
 
 def halo_m(reach_m: float | None) -> float:
-    """Return how far the rule reaches: a group, its gap, another group, and their surroundings.
+    """Return how far the rule reaches: a group, its gap, another, its pieces, their surroundings.
 
     Points in a row with one that would go are judged themselves, so its length comes on top.
 
@@ -105,7 +92,7 @@ def halo_m(reach_m: float | None) -> float:
     """
     if reach_m is None:
         return math.inf
-    return reach_m * (4.0 * GROUP + 3.0 + 2.0 * FAR_CELLS)
+    return reach_m * (5.0 * GROUP + 3.0 + 2.0 * FAR_CELLS)
 
 
 def reach_for(points: ArrayLike) -> float:
@@ -189,7 +176,17 @@ def judge(
     for_blocks(n, _BLOCK, test)
     reason = np.where(decisive == 1, Taken.OFF_SURFACE, Taken.IN_PAIR).astype(np.uint8)
     reason[~np.isfinite(margin)] = Taken.ALONE
-    lonely, groups = _group_margin(index, places, frame, spacing, whole, is_whole=is_whole)
+    parent = np.arange(n)
+    kernels.link(index.points, places, frame, spacing, LINK, parent)
+    lonely, groups = group_margin(
+        index,
+        parent,
+        spacing,
+        limit_m=GROUP * whole.reach_m,
+        many=whole.many,
+        own=whole.own,
+        is_whole=is_whole,
+    )
     is_worse = lonely > margin
     margin[is_worse], reason[is_worse] = lonely[is_worse], Taken.SMALL_GROUP
     _excuse_rows(index, spacing, reach, margin)
@@ -260,62 +257,3 @@ def _neighbours(
             lambda start, stop: kernels.drop_far(index.points, places, reach**2, start, stop),
         )
     return places, np.minimum(eighth, reach) * math.sqrt(math.pi / TESTS), reach
-
-
-def _group_margin(
-    index: Neighbourhood,
-    places: NDArray[np.int32],
-    frame: NDArray[np.float32],
-    spacing: Values,
-    whole: Whole,
-    *,
-    is_whole: bool,
-) -> tuple[Values, Groups]:
-    """Return gap / size (n,) of each point's group, 0 in a large one, and what groups there are.
-
-    Where the points are a whole cloud and no group is large, the one of most points is: a small
-    thing alone is what was scanned.
-
-    The size is the longest side of the group's box, or the side of the square that its points
-    would cover at the spacing here, if that is larger.
-    """
-    from dougong.kernels import protective as kernels
-
-    points, limit_m = index.points, GROUP * whole.reach_m
-    n = len(points)
-    parent = np.arange(n)
-    kernels.link(points, places, frame, spacing, LINK, parent)
-    held, sums = np.zeros(n, np.int64), np.zeros(n, np.int64)
-    extents = np.empty((n, 6))
-    steps = np.rint(spacing / SMALLEST_M * STEPS).astype(np.int64)
-    kernels.measure(points, steps, parent, held, sums, extents)
-    is_root = held > 0
-    longest = np.zeros(n)
-    longest[is_root] = (extents[is_root, 3:] - extents[is_root, :3]).max(axis=1)
-    is_large = (longest > limit_m) | (held >= whole.many)
-    own = parent[index.order < whole.own]
-    groups = Groups(bool(is_large[own].any()), int(held[own].max(initial=0)))
-    if is_whole and n and not is_large.any():
-        is_large = held == held.max()
-    chosen = is_large[parent]
-    asked = np.flatnonzero(~chosen)
-    margin = np.zeros(n)
-    if not len(asked):
-        return margin, groups
-    nodes = np.zeros(len(index.boxes), bool)
-    kernels.flag_nodes(chosen, nodes)
-    gap2 = np.empty(len(asked))
-    for_blocks(
-        len(asked),
-        _BLOCK,
-        lambda start, stop: kernels.gaps(
-            points, index.boxes, chosen, nodes, limit_m**2, asked[start:stop], gap2[start:stop]
-        ),
-    )
-    gap = np.full(n, np.inf)
-    np.minimum.at(gap, parent[asked], np.sqrt(gap2))
-    root = parent[asked]
-    covered = sums[root] / held[root] * (SMALLEST_M / STEPS) * np.sqrt(held[root])
-    size = np.maximum(covered, longest[root])
-    margin[asked] = gap[root] / size
-    return margin, groups
