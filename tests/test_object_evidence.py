@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dougong.registration.object_evidence import blocks_of, hear, is_worse, noise_of
+from dougong.registration.object_evidence import blocks_of, court_of, hear, is_worse, noise_of
 from dougong.registration.object_fit import body_of
 from dougong.registration.pose_search import view_of
 from dougong.registration.surface import surface
@@ -28,7 +28,7 @@ def pose(shift):
 
 def test_where_a_surface_goes_on_beyond_the_other_cloud_nothing_speaks_against():
     # Half of each plate has no counterpart: laid end over end, they are one longer plate.
-    heard = hear(plate(0.0, 1.0), plate(0.0, 1.0), pose((0.5, 0.0, 0.0)), 0.002, GAP)
+    heard = hear(court_of(plate(0.0, 1.0), plate(0.0, 1.0), 0.002, GAP), pose((0.5, 0.0, 0.0)))
     assert heard.explained == pytest.approx(0.5, abs=0.05)
     assert heard.loss.max() <= 1.0
     assert heard.explained_source == pytest.approx(0.5, abs=0.05)
@@ -36,9 +36,10 @@ def test_where_a_surface_goes_on_beyond_the_other_cloud_nothing_speaks_against()
 
 def test_a_surface_inside_what_the_other_cloud_shows_and_off_it_speaks_against():
     small, large = plate(0.0, 0.4), plate(0.0, 2.0)
-    on = hear(small, large, pose((0.0, 0.0, 0.0)), 0.002, GAP)
-    off = hear(small, large, pose((0.0, 0.0, 2.0 * GAP)), 0.002, GAP)
-    away = hear(small, large, pose((0.0, 0.0, 10.0 * GAP)), 0.002, GAP)
+    court = court_of(small, large, 0.002, GAP)
+    on = hear(court, pose((0.0, 0.0, 0.0)))
+    off = hear(court, pose((0.0, 0.0, 2.0 * GAP)))
+    away = hear(court, pose((0.0, 0.0, 10.0 * GAP)))
     count = len(small.view.points)
     assert on.loss[:count].mean() == pytest.approx(0.0, abs=0.01)
     assert off.loss[:count].mean() > 2.5
@@ -47,9 +48,10 @@ def test_a_surface_inside_what_the_other_cloud_shows_and_off_it_speaks_against()
 
 def test_a_pose_that_contradicts_loses_to_one_that_shows_less():
     small, large = plate(0.0, 1.0), plate(0.0, 1.0)
-    half = hear(small, large, pose((0.5, 0.0, 0.0)), 0.002, GAP)
-    whole_but_off = hear(small, large, pose((0.0, 0.0, 1.5 * GAP)), 0.002, GAP)
-    block, blocks = blocks_of(small.view, large.view, 8)
+    court = court_of(small, large, 0.002, GAP)
+    half = hear(court, pose((0.5, 0.0, 0.0)))
+    whole_but_off = hear(court, pose((0.0, 0.0, 1.5 * GAP)))
+    block, blocks = blocks_of(small.view, large.view)
     assert is_worse(half, whole_but_off, block, blocks, 3.0)
     assert not is_worse(whole_but_off, half, block, blocks, 3.0)
 

@@ -46,7 +46,6 @@ from dougong.registration.surface import surface
 from dougong.typing import Index, Points, Transform, Values
 
 MIN_POINTS = 50
-_BLOCKS_PER_SIDE = 8
 SAME_DEG = 8.0
 SAME_RADII = 0.08
 """Refined poses nearer than this, in degrees and RMS radii, are one."""
@@ -296,24 +295,21 @@ def _judge(views: tuple[View, View], poses: Poses, params: FreeRotation) -> _Jud
     radius, spacing = target.view.radius_m, max(v.spacing_m for v in views)
     reaches = (max(0.1 * radius, 3.0 * spacing), 2.5 * spacing)
     refined = [fitting.fit(source, target, _matrix(pose), reaches, iterations=12) for pose in poses]
-    gap = 1.5 * spacing
     sigma = evidence.noise_of(source, target, refined, 2.0 * spacing)
-    tolerance = max(sigma, 0.02 * spacing)
-    heard = sorted(
-        (evidence.hear(source, target, T, tolerance, gap) for T in refined), key=lambda h: h.total
-    )
+    court = evidence.court_of(source, target, max(sigma, 0.02 * spacing), 1.5 * spacing)
+    heard = sorted((evidence.hear(court, T) for T in refined), key=lambda h: h.total)
     kept: list[evidence.Testimony] = []
     for one in heard:
         if not any(fitting.near(one.T, k.T, SAME_DEG, SAME_RADII * radius) for k in kept):
             kept.append(one)
-    block, blocks = evidence.blocks_of(views[0], views[1], _BLOCKS_PER_SIDE)
+    block, blocks = evidence.blocks_of(*views)
     is_beaten = [evidence.is_worse(kept[0], k, block, blocks, params.sigmas) for k in kept[1:]]
     return _Judged(
         best=kept[0],
         rivals=tuple(k for k, beaten in zip(kept[1:], is_beaten, strict=True) if not beaten),
         others=tuple(k for k, beaten in zip(kept[1:], is_beaten, strict=True) if beaten),
         sigma_m=sigma,
-        sharpness=evidence.sharpness(source, target, kept[0], tolerance, gap),
+        sharpness=evidence.sharpness(court, kept[0]),
     )
 
 

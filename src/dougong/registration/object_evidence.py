@@ -4,6 +4,7 @@ A point that finds a like surface of the other cloud speaks for the pose. One th
 near says little: the other cloud may not show that part. One that finds the other cloud all around
 it, but not where it lies itself, speaks against: that part was seen, and is not as it should be.
 A pose that brings more of the clouds together, but so that they contradict each other, loses.
+Points that their own cloud contradicts as well (thin parts, edges between samples) are no witness.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from dougong.filters import neighbourhood
 from dougong.registration.object_fit import Body
 from dougong.registration.pose_search import View
-from dougong.typing import Index, Mask, Transform, Values
+from dougong.typing import Index, Mask, Points, Transform, Values
 
 _AROUND = 10
 """Nearest points that say whether the other cloud lies around a point, or to one side of it."""
@@ -28,12 +29,12 @@ a uniform density ten times as wide."""
 _BETWEEN_SAMPLES = 0.5
 """... but not less than this share of a gap: edges and thin parts between samples are not known
 better, however little the points scatter."""
-_CONTRADICTED = 2.0
-"""What a contradicted point costs beyond one that finds nothing; a match gains 1. Natural
-logarithms of odds: a tenth of the surface that both clouds show finds no match all the same."""
+_CONTRADICTED = 3.0
+"""What a contradicted point costs beyond one that finds nothing; a match gains 1."""
 _NEAR_GAPS = 4.0
 _ONE_SIDED, _ONE_SIDED_WIDTH = 0.8, 0.15
 _MOST_OF_IT = 0.8
+_BLOCKS_PER_RADIUS = 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +43,7 @@ class Testimony:
 
     T: Transform
     loss: Values
-    """(n + m,) 0 explained .. 1 nothing there .. 3 contradicted."""
+    """(n + m,) 0 explained .. 1 nothing there .. 4 contradicted."""
     is_near: Mask
     """(n + m,) the other cloud shows something within three gaps: a point can be judged there."""
     explained: float
@@ -74,21 +75,27 @@ class _Met:
 
 def _met(one: Body, other: Body, T: Transform) -> _Met:
     moved = one.view.points @ T[:3, :3].T + T[:3, 3]
-    turned = one.view.normals @ T[:3, :3].T
     count = min(_AROUND, len(other.view.points))
     places, distances = neighbourhood.knn(other.index, moved, count)
-    normals = other.view.normals[places[:, 0]]
-    offsets = moved[:, None] - other.view.points[places]
-    heights = np.einsum("kij,kj->ki", offsets, normals)
-    along = offsets - heights[:, :, None] * normals[:, None]
+    return _met_there(moved, one.view.normals @ T[:3, :3].T, other.view, places, distances)
+
+
+def _met_there(
+    points: Points, normals: Points, other: View, places: Index, distances: Values
+) -> _Met:
+    """Return what points (n, 3) meet that find `places` (n, k) of the other view, nearest first."""
+    planes = other.normals[places[:, 0]]
+    offsets = points[:, None] - other.points[places]
+    heights = np.einsum("kij,kj->ki", offsets, planes)
+    along = offsets - heights[:, :, None] * planes[:, None]
     reach = np.linalg.norm(along, axis=2).mean(axis=1)
     lean = np.linalg.norm(along.mean(axis=1), axis=1)
-    by_own = np.abs((turned * offsets[:, 0]).sum(axis=1))
+    by_own = np.abs((normals * offsets[:, 0]).sum(axis=1))
     return _Met(
         distance=distances[:, 0],
         plane=np.minimum(np.abs(heights[:, 0]), by_own),
         height=np.abs(heights[:, :_OF_ONE_PLANE].mean(axis=1)),
-        cosine=np.abs((normals * turned).sum(axis=1)),
+        cosine=np.abs((planes * normals).sum(axis=1)),
         one_sided=lean / np.maximum(reach, 1e-300),
     )
 
@@ -121,20 +128,53 @@ def noise_of(source: Body, target: Body, poses: Sequence[Transform], reach_m: fl
     return float(spreads[shares >= 0.6 * shares.max()].min())
 
 
-def hear(source: Body, target: Body, T: Transform, tolerance_m: float, gap_m: float) -> Testimony:
-    """Return what both clouds say about `T` (between views); `tolerance_m` one sigma.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Court:
+    """Two views, and by what their points are heard."""
+
+    source: Body
+    target: Body
+    tolerance_m: float
+    """One sigma of the plane distances."""
+    gap_m: float
+    """So far from the nearest sample nothing is known."""
+    trust: Values
+    """(n + m,) 1 a point may contradict a pose .. 0 its own cloud contradicts it as much."""
+
+
+def court_of(source: Body, target: Body, tolerance_m: float, gap_m: float) -> Court:
+    """Return a court that hears both views."""
+    doubt = []
+    for body in (source, target):
+        view = body.view
+        count = min(_AROUND, len(view.points) - 1)
+        places, distances = neighbourhood.knn(body.index, None, count)
+        met = _met_there(view.points, view.normals, view, places, distances)
+        missed = _missed(met, tolerance_m, gap_m)
+        doubt.append(np.where(missed < 1.0, 0.0, _contradicted(met, tolerance_m, gap_m)))
+    return Court(
+        source=source,
+        target=target,
+        tolerance_m=tolerance_m,
+        gap_m=gap_m,
+        trust=1.0 - np.concatenate(doubt),
+    )
+
+
+def hear(court: Court, T: Transform) -> Testimony:
+    """Return what both clouds say about `T` (between views).
 
     A point's error is the smaller of its distances along both normals, or its distance to the
-    nearest point beyond `gap_m` if that is more: between samples nothing is known.
+    nearest point beyond the gap if that is more: between samples nothing is known.
     """
-    met = _both_ways(source, target, T)
-    one, two = (_missed(m, tolerance_m, gap_m) for m in met)
-    against = np.concatenate([_contradicted(m, tolerance_m, gap_m) for m in met])
+    met = _both_ways(court.source, court.target, T)
+    one, two = (_missed(m, court.tolerance_m, court.gap_m) for m in met)
+    against = np.concatenate([_contradicted(m, court.tolerance_m, court.gap_m) for m in met])
     missed = np.concatenate([one, two])
     return Testimony(
         T=T,
-        loss=missed + _CONTRADICTED * np.where(missed < 1.0, 0.0, against),
-        is_near=np.concatenate([m.distance <= 3.0 * gap_m for m in met]),
+        loss=missed + _CONTRADICTED * np.where(missed < 1.0, 0.0, court.trust * against),
+        is_near=np.concatenate([m.distance <= 3.0 * court.gap_m for m in met]),
         explained=1.0 - float(missed.mean()),
         explained_source=float((one < 1.0).mean()),
         explained_target=float((two < 1.0).mean()),
@@ -166,15 +206,15 @@ def _contradicted(met: _Met, tolerance_m: float, gap_m: float) -> Values:
     return against
 
 
-def blocks_of(source: View, target: View, per_side: int) -> tuple[Index, int]:
+def blocks_of(source: View, target: View) -> tuple[Index, int]:
     """Return the block (n + m,) of every point, in either cloud's own cube grid, and their number.
 
-    Errors of neighbouring points go together; blocks are what counts as independent.
+    Errors of neighbouring points go together; blocks, a quarter of the radius wide, are what
+    counts as independent.
     """
     parts, start = [], 0
     for view in (source, target):
-        edge = float(np.ptp(view.points, axis=0).max()) / per_side
-        cell = np.floor(view.points / max(edge, 1e-300)).astype(np.int64)
+        cell = np.floor(view.points * (_BLOCKS_PER_RADIUS / view.radius_m)).astype(np.int64)
         _, block = np.unique(cell, axis=0, return_inverse=True)
         parts.append(block.ravel() + start)
         start += int(block.max()) + 1
@@ -201,19 +241,16 @@ def _differ(better: Values, other: Values, block: Index, blocks: int, sigmas: fl
     return bool(sums.sum() > sigmas * max(error, 1e-300))
 
 
-def sharpness(
-    source: Body, target: Body, best: Testimony, tolerance_m: float, gap_m: float
-) -> float:
+def sharpness(court: Court, best: Testimony) -> float:
     """Return how many times more a pose explains than six poses a fifth of the radius beside it.
 
     Their mean counts: a plate slides along itself in two directions, and still has its place.
     """
-    away = 0.2 * target.view.radius_m
+    away = 0.2 * court.target.view.radius_m
     around = 0.0
     for axis in range(3):
         for sign in (1.0, -1.0):
             T = best.T.copy()
             T[axis, 3] += sign * away
-            heard = hear(source, target, T, tolerance_m, gap_m)
-            around += heard.explained / 6.0
+            around += hear(court, T).explained / 6.0
     return best.explained / max(around, 0.02)
