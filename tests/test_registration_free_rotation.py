@@ -230,3 +230,18 @@ def test_what_cannot_be_registered_is_refused():
         register_object(chair(2), broken)
     with pytest.raises(RegistrationError, match="at one place"):
         register_object(np.ones((100, 3)), chair(1))
+
+
+def test_two_real_scans_of_a_lion_that_share_a_third(data):
+    """Whatever the frames: what is kept of 60,000 points differs a little by where they lie."""
+    estimate = np.loadtxt(data / "lion_scans/reference_T.txt")
+    target, source = (np.loadtxt(data / f"lion_scans/lionscan{n}.xyz")[:, :3] for n in (1, 2))
+    # The estimate is by trimmed point-to-point ICP, good to about a degree.
+    for shift in (0.0, 37.0):
+        found = register_object(source + shift, target)
+        assert found.status == "ok"
+        expected = estimate.copy()
+        expected[:3, 3] -= estimate[:3, :3] @ np.full(3, shift)
+        degrees, distance = errors(found.T_target_source, expected, source + shift)
+        assert degrees < 2.0
+        assert distance < 0.02 * np.ptp(target, axis=0).max()

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -28,13 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field as Limits
 
-from dougong.evaluation.metrics import rotation_angle_deg
 from dougong.evaluation.object_methods import METHODS, TOLD
 from dougong.evaluation.object_symmetry import (
     CORRECT_DEG,
     CORRECT_RADII,
     Shape,
     describe_shape,
+    pose_error,
     symmetric_error,
 )
 from dougong.params import Parameters
@@ -172,18 +172,30 @@ def run_ladder(
     ladder = ladder or Ladder()
     trials = []
     for name, points in shapes.items():
-        shape = describe_shape(name, points)
-        for level, motion in itertools.product(ladder.levels, ladder.motions):
-            for pose in range(ladder.poses):
-                which = (LEVELS.index(level), MOTIONS.index(motion), pose)
-                rng = np.random.default_rng((ladder.seed, *which, *name.encode()))
-                source, target, truth = make_pair(shape.points, level, motion, ladder.points, rng)
-                for method in ladder.methods:
-                    trial = _trial(shape, level, motion, method, (source, target, truth), ladder)
-                    trials.append(trial)
-                    if tell is not None:
-                        tell(trial)
+        for trial in climb(describe_shape(name, points), ladder):
+            trials.append(trial)
+            if tell is not None:
+                tell(trial)
     return trials
+
+
+def climb(shape: Shape, ladder: Ladder) -> Iterator[Trial]:
+    """Yield the trials of one shape; ours is told nothing twice where nothing can be told."""
+    for level, motion in itertools.product(ladder.levels, ladder.motions):
+        methods = [m for m in ladder.methods if m != TOLD or MOST_DEG[motion] < 180.0]
+        for number in range(ladder.poses):
+            pair = draw_pair(shape, level, motion, number, ladder)
+            for method in methods:
+                yield _trial(shape, level, motion, method, pair, ladder)
+
+
+def draw_pair(
+    shape: Shape, level: Level, motion: Motion, number: int, ladder: Ladder
+) -> tuple[Points, Points, Transform]:
+    """Return source, target and true motion of a shape's pair by its number."""
+    which = (LEVELS.index(level), MOTIONS.index(motion), number)
+    rng = np.random.default_rng((ladder.seed, *which, *shape.name.encode()))
+    return make_pair(shape.points, level, motion, ladder.points, rng)
 
 
 def _trial(
@@ -205,8 +217,7 @@ def _trial(
     best = found.hypotheses[0].T_target_source if found.hypotheses else None
     error = like = (float("nan"), float("nan"))
     if best is not None:
-        turn = rotation_angle_deg(best[:3, :3], truth[:3, :3])
-        error = float(turn), float(np.linalg.norm(best[:3, 3] - truth[:3, 3]))
+        error = pose_error(best, truth)
         like = error if _is_right(error) else symmetric_error(best, truth, shape)
     return Trial(
         shape=shape.name,

@@ -143,11 +143,12 @@ def _fitted_symmetry(T: Transform, shape: Shape) -> Transform | None:
 
 def is_near(a: Transform, b: Transform) -> bool:
     """Say whether two poses of a shape are within 5 degrees and 0.05 of each other."""
-    angle, shift = _apart(a, b)
+    angle, shift = pose_error(a, b)
     return angle < CORRECT_DEG and shift < CORRECT_RADII
 
 
-def _apart(a: Transform, b: Transform) -> tuple[float, float]:
+def pose_error(a: Transform, b: Transform) -> tuple[float, float]:
+    """Return the angle (deg) and the shift between two poses of a shape."""
     angle = rotation_angle_deg(a[:3, :3], b[:3, :3])
     return float(angle), float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
 
@@ -161,4 +162,4 @@ def symmetric_error(T: Transform, truth: Transform, shape: Shape) -> tuple[float
     motion = np.linalg.inv(truth) @ T
     fitted = _fitted_symmetry(motion, shape)
     equal = [np.eye(4), *shape.symmetries, *([] if fitted is None else [fitted])]
-    return min(_apart(S, motion) for S in equal)
+    return min(pose_error(S, motion) for S in equal)

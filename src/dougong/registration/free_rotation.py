@@ -64,7 +64,7 @@ class FreeRotation(Parameters):
     """Rotations of the even grid; 0: axes and features only."""
     max_angle_deg: Annotated[float, Limits(gt=0, le=180)] = 180.0
     """The source is known to be turned by no more than this."""
-    features: SacIa | None = SacIa(trials=20_000, returned=60)
+    features: SacIa | None = SacIa(trials=100_000, returned=100)
     """Sample consensus on features; None: axes and grid only."""
     refined: Annotated[int, Limits(ge=1)] = 24
     """Distinct poses that are refined and compared."""

@@ -29,7 +29,9 @@ a uniform density ten times as wide."""
 _BETWEEN_SAMPLES = 0.5
 """... but not less than this share of a gap: edges and thin parts between samples are not known
 better, however little the points scatter."""
-_CONTRADICTED = 3.0
+_UNRESOLVED = 0.75
+"""The same share for what contradicts: a sheet half a gap thick is no contradiction."""
+_CONTRADICTED = 4.0
 """What a contradicted point costs beyond one that finds nothing; a match gains 1."""
 _NEAR_GAPS = 4.0
 _ONE_SIDED, _ONE_SIDED_WIDTH = 0.8, 0.15
@@ -43,7 +45,7 @@ class Testimony:
 
     T: Transform
     loss: Values
-    """(n + m,) 0 explained .. 1 nothing there .. 4 contradicted."""
+    """(n + m,) 0 explained .. 1 nothing there .. 5 contradicted."""
     is_near: Mask
     """(n + m,) the other cloud shows something within three gaps: a point can be judged there."""
     explained: float
@@ -139,7 +141,7 @@ class Court:
     gap_m: float
     """So far from the nearest sample nothing is known."""
     trust: Values
-    """(n + m,) 1 a point may contradict a pose .. 0 its own cloud contradicts it as much."""
+    """(n + m,) 1 a point may contradict a pose .. 0 its own cloud contradicts all around it."""
 
 
 def court_of(source: Body, target: Body, tolerance_m: float, gap_m: float) -> Court:
@@ -151,7 +153,9 @@ def court_of(source: Body, target: Body, tolerance_m: float, gap_m: float) -> Co
         places, distances = neighbourhood.knn(body.index, None, count)
         met = _met_there(view.points, view.normals, view, places, distances)
         missed = _missed(met, tolerance_m, gap_m)
-        doubt.append(np.where(missed < 1.0, 0.0, _contradicted(met, tolerance_m, gap_m)))
+        against = np.where(missed < 1.0, 0.0, _contradicted(met, tolerance_m, gap_m))
+        # A single point may be spared by chance: its neighbourhood tells.
+        doubt.append((against + against[places].sum(axis=1)) / (1.0 + count))
     return Court(
         source=source,
         target=target,
@@ -181,14 +185,15 @@ def hear(court: Court, T: Transform) -> Testimony:
     )
 
 
-def _reach(tolerance_m: float, gap_m: float) -> float:
+def _reach(tolerance_m: float, gap_m: float, share: float) -> float:
     """Return how far from the other surface a point may lie to count as on it."""
-    return max(_TIGHT * tolerance_m, _BETWEEN_SAMPLES * gap_m)
+    return max(_TIGHT * tolerance_m, share * gap_m)
 
 
 def _missed(met: _Met, tolerance_m: float, gap_m: float) -> Values:
     """Return 0 for a point that lies on a like surface .. 1 for one that does not."""
-    error = np.maximum(met.plane, met.distance - gap_m) / _reach(tolerance_m, gap_m)
+    reach = _reach(tolerance_m, gap_m, _BETWEEN_SAMPLES)
+    error = np.maximum(met.plane, met.distance - gap_m) / reach
     missed: Values = np.where(met.cosine > _ALIKE, np.clip(error, 0.0, 1.0), 1.0)
     return missed
 
@@ -199,7 +204,7 @@ def _contradicted(met: _Met, tolerance_m: float, gap_m: float) -> Values:
     At the rim of what the other cloud shows nothing is said, nor where its surface goes on.
     """
     height = np.where(met.cosine > _ALIKE, met.plane, met.height)
-    off = height / _reach(tolerance_m, gap_m) - 0.5
+    off = height / _reach(tolerance_m, gap_m, _UNRESOLVED) - 0.5
     around = (_ONE_SIDED - met.one_sided) / _ONE_SIDED_WIDTH
     near = _NEAR_GAPS - met.distance / gap_m
     against: Values = np.prod([np.clip(x, 0.0, 1.0) for x in (off, around, near)], axis=0)
