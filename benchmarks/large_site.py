@@ -28,8 +28,10 @@ from typing import Any
 
 import numpy as np
 
+import dougong
 from dougong.cloud import Cloud
-from dougong.formats import write
+from dougong.evaluation.machine import machine
+from dougong.formats import describe, write
 
 PIECE = 1_000_000
 YARD = np.array([120.0, 80.0])
@@ -168,8 +170,8 @@ voxel_m = {voxel}
 """
 
 
-def work(folder: Path, verb: str, memory: str, voxel: float) -> list[dict[str, Any]]:
-    """Filter or run the site, and return a row per command."""
+def work(folder: Path, verb: str, memory: str, voxel: float) -> dict[str, Any]:
+    """Filter or run the site; return what was asked, and a row per command."""
     start = [sys.executable, "-m", "dougong"]
     rows = [decoded(folder)]
     with TemporaryDirectory(dir=folder) as out:
@@ -190,7 +192,9 @@ def work(folder: Path, verb: str, memory: str, voxel: float) -> list[dict[str, A
     rows.append(decoded(folder))
     for row in rows:
         print(json.dumps(row))
-    return rows
+    points = sum(describe(folder / f"{name}.laz").points for name in ("scan", "drone"))
+    asked = {"points": points, "memory": memory, "voxel_m": voxel}
+    return {**asked, "machine": machine(), "version": dougong.__version__, "jobs": rows}
 
 
 def _told(document: dict[str, Any]) -> dict[str, Any]:
@@ -209,14 +213,15 @@ def main() -> None:
     parser.add_argument("--points", type=float, default=1e7)
     parser.add_argument("--memory", default="2GB")
     parser.add_argument("--voxel", type=float, default=0.005)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="JSON lines: a line is added")
     asked = parser.parse_args()
     if asked.verb == "make":
         make(asked.folder, int(asked.points))
         return
-    rows = work(asked.folder, asked.verb, asked.memory, asked.voxel)
+    measured = work(asked.folder, asked.verb, asked.memory, asked.voxel)
     if asked.json:
-        asked.json.write_text(json.dumps(rows, indent=1))
+        with asked.json.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(measured) + "\n")
 
 
 if __name__ == "__main__":

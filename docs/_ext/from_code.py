@@ -3,7 +3,7 @@
 ``{parameters} MODULE:MODEL TABLE`` lists the fields of a parameter set and of those within it;
 ``{commands}`` every command and its options; ``{reasons}`` the reason codes of removed points;
 ``{evidence} STUDY [KEY=VALUE]`` the table of a study that was run, or how to run it; ``{bench}``
-that of the speed measurements.
+that of the speed measurements; ``{large-site}`` those of runs larger than memory.
 """
 
 from __future__ import annotations
@@ -261,6 +261,44 @@ def _said(rows: Sequence[dict[str, Any]]) -> Sequence[dict[str, Any]]:
     return [{key: row.get(key) for key in keys} for row in rows]
 
 
+class LargeSite(Written):
+    """Runs of ``benchmarks/large_site.py run``, smallest first: ``{large-site}``."""
+
+    def markdown(self) -> Iterator[str]:
+        """Yield who measured what where, a row per run, and where its CPU time went."""
+        path = EVIDENCE / "large_site.jsonl"
+        self.env.note_dependency(str(path))
+        lines = path.read_text(encoding="utf-8").splitlines()
+        runs = sorted(map(json.loads, lines), key=lambda run: (run["points"], run["memory"]))
+        machine = runs[-1]["machine"]
+        yield f"{machine['processor']}, {machine['cores']} cores, {machine['memory_gb']} GB."
+        yield ""
+        head = ("points", "`--memory`", "peak, GB", "points merged", "wall, s", "CPU, s")
+        head = (*head, "CPU a point, us", "decoding alone, CPU s", "run / decoding, CPU")
+        yield from table(head, [_run_cells(run) for run in runs])
+        stages = list(_the_run(runs[-1])["cpu_seconds"])
+        rows = [
+            [f"{run['points']:,}", *(_cell(_the_run(run)["cpu_seconds"][s]) for s in stages)]
+            for run in runs
+        ]
+        yield from ("CPU seconds by stage:", "", *table(["points", *stages], rows))
+
+
+def _the_run(run: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = next(job for job in run["jobs"] if job["job"] == "run")
+    return found
+
+
+def _run_cells(run: dict[str, Any]) -> list[str]:
+    job = _the_run(run)
+    decoding = [j["cpu_s"] for j in run["jobs"] if j["job"] == "decode"]
+    alone = sum(decoding) / len(decoding)
+    numbers = (job["peak_pss_bytes"] / 1e9, job["merged"]["points"], job["wall_s"], job["cpu_s"])
+    per_point = 1e6 * job["cpu_s"] / run["points"]
+    numbers = (*numbers, per_point, alone, job["cpu_s"] / alone)
+    return [f"{run['points']:,}", run["memory"], *(_cell(number) for number in numbers)]
+
+
 def _shown_rows(rows: Sequence[dict[str, Any]]) -> tuple[Sequence[dict[str, Any]], str]:
     """Return the rows that fit on a page, and what was left out: the summaries go first."""
     if len(rows) <= MOST_ROWS:
@@ -306,4 +344,5 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("reasons", Reasons)
     app.add_directive("evidence", Evidence)
     app.add_directive("bench", Bench)
+    app.add_directive("large-site", LargeSite)
     return {"parallel_read_safe": True}
