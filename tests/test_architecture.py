@@ -13,14 +13,14 @@ ALLOWED = {
     "kernels": set(),
     "_sorting": BASE | {"kernels"},
     "cloud": BASE,
-    "filters": BASE | {"cloud", "kernels"},
+    "filters": BASE | {"_sorting", "cloud", "kernels"},
     "formats": BASE | {"_sorting", "cloud", "kernels"},
     "registration": BASE | {"_sorting", "cloud", "kernels", "filters"},
     "tiles": BASE | {"cloud", "kernels", "filters", "formats"},
     "pipeline": BASE
     | {"_sorting", "cloud", "kernels", "filters", "formats", "registration", "tiles"},
     "evaluation": BASE | {"cloud", "kernels", "filters", "formats", "registration", "pipeline"},
-    "report": BASE | {"cloud", "formats", "filters", "registration", "pipeline"},
+    "report": BASE | {"_sorting", "cloud", "formats", "filters", "registration", "pipeline"},
     "app": BASE
     | {
         "cloud",

@@ -1,11 +1,12 @@
 """Sorting by radix is NumPy's stable sort, negative numbers and all."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dougong._sorting import grouped, sorted_places
+from dougong._sorting import count_rows, distinct, grouped, once, sorted_places
 
 SIZES = st.integers(0, 60)
 SOME = [-(2**63), -1, 0, 1, 7, 2**40, 2**63 - 1]
@@ -30,3 +31,18 @@ def test_groups_are_numpys(keys):
     wanted = np.unique(keys, return_inverse=True, return_counts=True)
     for found, right in zip(grouped(keys), wanted, strict=True):
         np.testing.assert_array_equal(found, right)
+
+
+@settings(deadline=None)
+@given(SIGNED)
+def test_distinct_is_numpys_unique(keys):
+    np.testing.assert_array_equal(distinct(keys), np.unique(keys))
+    np.testing.assert_array_equal(once(np.sort(keys)), np.unique(keys))
+
+
+@pytest.mark.parametrize("scale", [1, 1 << 60])
+@given(
+    cells=arrays(np.int64, st.tuples(st.integers(0, 60), st.just(3)), elements=st.integers(-2, 2))
+)
+def test_rows_are_counted_once_each(cells, scale):
+    assert count_rows(cells * scale) == len(np.unique(cells, axis=0))

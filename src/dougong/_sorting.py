@@ -3,13 +3,15 @@
 The kernel is imported when called.
 """
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dougong.typing import Index
 
+Number = TypeVar("Number", bound=np.integer[Any])
 _KEY_BITS = 64
 _SIGN = np.uint64(1 << 63)
 
@@ -36,6 +38,35 @@ def sorted_places(keys: NDArray[np.uint64] | NDArray[np.int64]) -> Index:
         spare = np.empty(len(keys), np.uint64)
         radix_argsort(keys.view(np.uint64) ^ sign, _KEY_BITS, places, np.empty_like(places), spare)
     return places
+
+
+def distinct(keys: NDArray[Number]) -> NDArray[Number]:
+    """Return each of `keys` (n,) once, ascending.
+
+    ``numpy.unique`` of whole numbers hashes them (numpy 2.3 and later): twenty times slower.
+    """
+    return once(np.sort(keys))
+
+
+def once(ordered: NDArray[Number]) -> NDArray[Number]:
+    """Return each of the ascending numbers `ordered` (n,) once."""
+    is_first = np.ones(len(ordered), np.bool_)
+    is_first[1:] = ordered[1:] != ordered[:-1]
+    return ordered[is_first]
+
+
+def count_rows(cells: NDArray[np.int64]) -> int:
+    """Return how many different rows `cells` (n, k) has."""
+    if not len(cells):
+        return 0
+    low, high = cells.min(axis=0), cells.max(axis=0)
+    spans = [int(last) - int(first) + 1 for first, last in zip(low, high, strict=True)]
+    if math.prod(spans) >= 1 << 63:
+        return len(np.unique(cells, axis=0))
+    key = np.zeros(len(cells), np.int64)
+    for column, span in enumerate(spans):
+        key = key * span + (cells[:, column] - low[column])
+    return len(distinct(key))
 
 
 def grouped(keys: NDArray[np.int64]) -> Groups:

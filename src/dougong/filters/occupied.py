@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong._boxes import are_within
+from dougong._sorting import distinct, once
 from dougong.filters.octree_voxel_grid import Root
 from dougong.threads import for_blocks
 from dougong.typing import Blocks, Points
@@ -21,10 +22,10 @@ def deepest_leaf_m(blocks: Blocks, root: Root, most: int) -> float:
     level = DEEPEST
     keys = np.empty(0, np.uint64)
     for block in blocks():
-        keys = np.union1d(keys, _keys(block, root, level))
+        keys = distinct(np.concatenate([keys, _keys(block, root, level)]))
         while len(keys) > most and level > 0:
             # A node's key without its last three bits is that of its parent.
-            keys = np.unique(keys >> np.uint64(3))
+            keys = once(keys >> np.uint64(3))
             level -= 1
     return root.edge_m / 2.0**level
 
@@ -42,4 +43,4 @@ def _keys(points: Points, root: Root, level: int) -> NDArray[np.uint64]:
         1 << 18,
         lambda start, stop: order.morton_keys(inside, root.low, cell_m, start, stop, keys),
     )
-    return np.unique(keys)
+    return distinct(keys)

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from dougong._sorting import distinct
 from dougong.cloud import Cloud, Frame
 from dougong.pipeline.links import Linked, register_pair
 from dougong.pipeline.movers import Mover, ReducedClouds
@@ -263,7 +264,7 @@ def _cells(search: _Search, name: str, T: Transform) -> frozenset[int]:
     step = max(1, len(cloud.xyz) // _MOST_CELLS)
     cell = np.floor((cloud.xyz[::step] @ local[:3, :3].T + local[:3, 3]) / _CELL_M)
     key = (cell + (1 << 20)).astype(np.int64)
-    return frozenset(np.unique((key[:, 0] << 42) | (key[:, 1] << 21) | key[:, 2]).tolist())
+    return frozenset(distinct((key[:, 0] << 42) | (key[:, 1] << 21) | key[:, 2]).tolist())
 
 
 def _shared(one: frozenset[int], other: frozenset[int]) -> float:

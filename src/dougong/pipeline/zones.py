@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong._boxes import corners_of
-from dougong._sorting import grouped
+from dougong._sorting import distinct, grouped
 from dougong.typing import Index, Mask, Points, Values
 
 _LATTICE_M = 1e-4
@@ -130,7 +130,7 @@ class ZoneSums:
         first = [np.bincount(place, lattice[:, k], count) for k in range(3)]
         second = [np.bincount(place, lattice[:, a] * lattice[:, b], count) for a, b in _PAIRS]
         new = np.stack([counts.astype(np.float64), *first, *second], axis=1)
-        both = np.union1d(self._keys, keys)
+        both = distinct(np.concatenate([self._keys, keys]))
         sums = np.zeros((len(both), 10))
         sums[np.searchsorted(both, self._keys)] = self._sums
         sums[np.searchsorted(both, keys)] += new

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from dougong._sorting import distinct
 from dougong.params import Parameters
 from dougong.registration.cleaning import extent
 from dougong.registration.levelling import rotation_to_vertical
@@ -135,4 +136,4 @@ def _lift(edges: NDArray[np.bool_], highest: Index, height: NDArray[np.float64])
             is_higher = is_empty & (other >= 0)
             is_higher &= (best < 0) | (height[other] > height[best])
             best = np.where(is_higher, other, best)
-    return np.unique(best[best >= 0])
+    return distinct(best[best >= 0])

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from dougong._sorting import count_rows, distinct
 from dougong.filters import neighbourhood
 from dougong.typing import Index, Mask, Points, Values
 
@@ -130,7 +131,7 @@ def _grow_one(
     frontier = np.array([seed])
     normal, middle, fitted = normals[seed], core[seed], 1
     while len(frontier):
-        asked = np.unique(near[frontier])
+        asked = distinct(near[frontier].ravel())
         asked = asked[asked >= 0]
         asked = asked[is_open[asked] & ~is_member[asked]]
         is_on = np.abs((core[asked] - middle) @ normal) <= tolerance_m
@@ -231,7 +232,7 @@ def _area(core: Points, normals: Points, spacing_m: float) -> float:
     cell = 2.0 * spacing_m
     at = np.floor(np.column_stack([core @ along, core @ across]) / cell).astype(np.int64)
     lean = float(np.clip(np.abs(normals @ normal).mean(), 0.2, 1.0))
-    return len(np.unique(at, axis=0)) * cell**2 / lean
+    return count_rows(at) * cell**2 / lean
 
 
 def _mean(normals: Points) -> Values:

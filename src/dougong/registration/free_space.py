@@ -86,8 +86,7 @@ def free_space(points: Points, seen_from: Points | None) -> FreeSpace | None:
     if seen_from is None:
         place = find_place(points)
     else:
-        places = np.unique(seen_from, axis=0)
-        place = places[0] if len(places) == 1 and np.isfinite(places).all() else None
+        place = seen_from[0] if len(seen_from) and (seen_from == seen_from[0]).all() else None
     return None if place is None else FreeSpace(place=place, ranges=_ranges(points, place))
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from dougong._checks import as_points
+from dougong._sorting import distinct
 from dougong.cloud import Cloud
 from dougong.errors import RegistrationError
 from dougong.filters.cloth_simulation import ClothSimulation, cloth_simulation
@@ -232,7 +233,7 @@ def _ground(level: Points, sigma_m: float, params: Prepare, notes: list[str]) ->
     height[stays] = found.attributes["height_above_ground"]
     cell = np.floor((level[:, :2] - extent(level)[0][:2]) / 1.0).astype(np.int64)
     flat = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
-    share = len(np.unique(flat[is_ground])) / len(np.unique(flat))
+    share = len(distinct(flat[is_ground])) / len(distinct(flat))
     is_known = np.isfinite(height)
     if share < params.min_ground_share or not is_known.any():
         notes.append(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dougong._sorting import count_rows
 from dougong.filters.selection import Reason
 from dougong.formats import read
 from dougong.report.figures import Figure
@@ -84,8 +85,8 @@ def _one(folder: Path, cloud: Mapping[str, Any], layer: Layer) -> Removal:
 
 def surface_m2(layer: Layer) -> float:
     """Return about how much surface a cloud shows: occupied voxels times their face."""
-    cells = np.unique(np.floor(layer.after / _SURFACE_CELL_M).astype(np.int64), axis=0)
-    return max(len(cells) * _SURFACE_CELL_M**2, _SURFACE_CELL_M**2)
+    cells = count_rows(np.floor(layer.after / _SURFACE_CELL_M).astype(np.int64))
+    return max(cells * _SURFACE_CELL_M**2, _SURFACE_CELL_M**2)
 
 
 def _map(folder: Path, cloud: Mapping[str, Any], layer: Layer) -> tuple[Figure | None, str]:
