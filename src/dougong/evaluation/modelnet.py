@@ -34,6 +34,7 @@ from dougong.evaluation.object_symmetry import (
     CORRECT_RADII,
     Shape,
     describe_shape,
+    is_equal,
     pose_error,
     symmetric_error,
 )
@@ -245,7 +246,7 @@ def _is_listed(found: ObjectRegistration, truth: Transform, shape: Shape) -> boo
     if found.status != "ambiguous":
         return False
     poses = [h.T_target_source for h in found.hypotheses[1:]]
-    return any(_is_right(symmetric_error(T, truth, shape)) for T in poses)
+    return any(is_equal(T, truth, shape) for T in poses)
 
 
 def summarise(trials: Sequence[Trial]) -> list[dict[str, float | str | int]]:

@@ -153,6 +153,14 @@ def pose_error(a: Transform, b: Transform) -> tuple[float, float]:
     return float(angle), float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
 
 
+def is_equal(T: Transform, truth: Transform, shape: Shape) -> bool:
+    """Say whether a pose is within 5 degrees and 0.05 of one that the shape makes true."""
+    motion = np.linalg.inv(truth) @ T
+    known = (np.eye(4), *shape.symmetries)
+    # The dense fit costs more than all else: it is asked where nothing known is near.
+    return any(is_near(S, motion) for S in known) or is_symmetry(motion, shape)
+
+
 def symmetric_error(T: Transform, truth: Transform, shape: Shape) -> tuple[float, float]:
     """Return angle (deg) and shift of `T` from the nearest pose that the shape makes true.
 

@@ -67,7 +67,7 @@ def _draw_object_iterations(panel: Any, rows: Rows) -> None:
     panel.set_xscale("log")
     panel.set_ylim(-3, 103)
     panel.set_xlabel("most fine iterations per reach, from the first coarse pose", fontsize=9)
-    panel.set_ylabel("pairs within 5 degrees and 0.05, percent", fontsize=9)
+    panel.set_ylabel("shapes without symmetry: correct, percent", fontsize=9)
     panel.grid(alpha=0.3)
     panel.legend(fontsize=6, ncol=2)
 
