@@ -19,6 +19,7 @@ def command(
         "filtering",
         "storage",
         "coarse",
+        "objects",
         "growth",
         "peers",
     ],
@@ -46,8 +47,9 @@ def command(
         buildings: five kinds of building through the whole program, against the truth.
         filtering: octree depth and cloth threshold, and what each costs. storage: bytes before
         and after, by format. coarse: coarse methods, precision, recall and convergence.
-        growth: errors, seconds and memory against the number of points. peers: the same pairs
-        through other programs, as far as they are installed.
+        objects: the same on objects that lie any way round. growth: errors, seconds and memory
+        against the number of points. peers: the same pairs through other programs, as far as
+        they are installed.
     out
         Folder for the files; default: dougong-STUDY in the current folder.
     quick

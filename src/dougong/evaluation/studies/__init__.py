@@ -33,6 +33,7 @@ STUDIES: Mapping[str, str] = {
     "filtering": "octree depth and cloth threshold: reduction, and what it costs",
     "storage": "bytes on disk before and after, by format",
     "coarse": "coarse methods: precision, recall, convergence",
+    "objects": "objects of unknown attitude: precision, recall, errors, by level",
     "growth": "errors, seconds and memory against the number of points",
     "peers": "the same pairs through other programs",
 }

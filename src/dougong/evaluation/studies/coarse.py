@@ -1,8 +1,7 @@
-"""Coarse methods: precision and recall on buildings and on ModelNet40, and how they converge.
+"""Coarse methods: precision and recall on buildings, and how they converge.
 
 Every method proposes poses; what follows (fine fit, verdict) is the same for all, and may abstain.
-Precision: correct / returned. Recall: correct / all (METHOD.md 5). With ``--data`` the folder's
-``modelnet40_half/modelnet40_half.npz`` is climbed too (`dougong.evaluation.modelnet`).
+Precision: correct / returned. Recall: correct / all (METHOD.md 5). Objects: the study `objects`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,14 +20,6 @@ from dougong.evaluation.coarse_trials import (
 from dougong.evaluation.scenes import BUILDERS, make_scene
 from dougong.evaluation.studies import Findings, Setting, measured
 from dougong.evaluation.studies.coarse_figure import draw_coarse
-from dougong.evaluation.studies.coarse_objects import (
-    LADDER,
-    LINE,
-    QUICK_LADDER,
-    object_lines,
-    object_rows,
-    shapes_in,
-)
 from dougong.evaluation.tabulate import as_text, chosen, distinct, spread
 from dougong.pipeline.progress import Progress
 
@@ -36,12 +27,11 @@ RUNS, QUICK_RUNS = 3, 1
 POINTS, QUICK_POINTS = 250_000, 30_000
 QUICK_KINDS = ("hall",)
 AGAINST = (
-    "the true pose: on buildings correct is TRE95 of at most 50 mm (a coarse pose: right within 2 "
-    "degrees of yaw and 0.5 m in plan), on ModelNet40 within 5 degrees and 0.05 radii"
+    "the true pose: correct is TRE95 of at most 50 mm; a coarse pose is right within 2 degrees of "
+    "yaw and 0.5 m in plan"
 )
 COLUMNS = {
     "on": "on",
-    "shapes": "shapes",
     "method": "method",
     "n": "n",
     "first_right_percent": "first right %",
@@ -51,40 +41,28 @@ COLUMNS = {
     "wrong": "wrong",
     "precision_percent": "precision %",
     "recall_percent": "recall %",
-    "precision_symmetric_percent": "symmetric precision %",
-    "recall_symmetric_percent": "symmetric recall %",
     "error": "error",
-    "error_mean": "mean",
-    "error_symmetric_mean": "symmetric mean",
     "error_unit": "of",
     "seconds": "seconds",
 }
 
 
 def study(setting: Setting, progress: Progress) -> Findings:
-    """Compare the methods on every building, and on ModelNet40 if its folder is given."""
+    """Compare the methods on every building."""
     kinds = QUICK_KINDS if setting.is_quick else tuple(BUILDERS)
     points = setting.points or (QUICK_POINTS if setting.is_quick else POINTS)
-    ladder = QUICK_LADDER if setting.is_quick else LADDER
-    shapes = {} if setting.data is None else shapes_in(setting.data, setting.is_quick)
 
-    def measure(on: str, name: str, seed: int, points: int) -> dict[str, Any]:
-        if on == "buildings":
-            return {"rows": list(building_rows(name, seed, points, setting.is_quick))}
-        one = ladder.model_copy(update={"seed": seed})
-        return {"rows": list(object_rows(name, shapes[name], one, setting.is_quick))}
+    def measure(kind: str, seed: int, points: int) -> dict[str, Any]:
+        return {"rows": list(building_rows(kind, seed, points, setting.is_quick))}
 
-    keys: list[tuple[Any, ...]] = []
-    for seed in setting.seeds(RUNS, QUICK_RUNS):
-        keys += [("buildings", kind, seed, points) for kind in kinds]
-        keys += [("modelnet40", name, seed, ladder.points) for name in shapes]
+    keys = [(kind, seed, points) for seed in setting.seeds(RUNS, QUICK_RUNS) for kind in kinds]
     rows = [row for one in measured(setting, keys, measure, progress) for row in one["rows"]]
     table = summary(rows)
     text = (
         "Over n pairs. First right, among 8: the poses as proposed; fitted: the first one is "
         "correct after the fine fit.\nReturned, precision, recall: of the whole registration that "
         "starts from them, which may abstain. Error: median, of\nthe first pose fitted. Seconds: "
-        "median, on buildings of the coarse search alone.\n\n" + as_text(table, COLUMNS)
+        "median, of the coarse search alone.\n\n" + as_text(table, COLUMNS)
     )
     return Findings(
         rows=rows,
@@ -122,14 +100,14 @@ def building_rows(
 
 
 def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return a row per method on the buildings, and per level, motion, method and shapes."""
+    """Return a row per method on all buildings, and on each."""
     table = []
     pairs = chosen(rows, part="pairs", on="buildings")
     groups = [(kind, chosen(pairs, building=kind)) for (kind,) in distinct(pairs, "building")]
     for name, group in [("buildings", pairs), *groups]:
         for (method,) in distinct(group, "method"):
             table.append(_building_line(name, method, chosen(group, method=method)))
-    return [*table, *object_lines(chosen(rows, part="pairs", on="modelnet40"))]
+    return table
 
 
 def _building_line(name: str, method: str, group: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -138,8 +116,6 @@ def _building_line(name: str, method: str, group: Sequence[Mapping[str, Any]]) -
     with_verdict = [row for row in group if row["status"] is not None]
     error, seconds = spread(group, "fitted95_mm", 2), spread(group, "coarse_s", 2)
     return {
-        **dict.fromkeys(LINE),
-        "part": "buildings",
         "on": name,
         "method": method,
         "n": len(group),
