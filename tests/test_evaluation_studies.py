@@ -12,8 +12,18 @@ from dougong.evaluation import building_runs, coarse_trials, registration_peers
 from dougong.evaluation.apart import apart
 from dougong.evaluation.metrics import pose_errors
 from dougong.evaluation.scenes import make_scene
-from dougong.evaluation.studies import Setting, buildings, coarse, filtering, growth, peers, storage
+from dougong.evaluation.studies import (
+    Setting,
+    buildings,
+    coarse,
+    filtering,
+    growth,
+    objects,
+    peers,
+    storage,
+)
 from dougong.evaluation.studies.coarse_figure import draw_coarse
+from dougong.evaluation.studies.objects_figure import draw_objects
 from dougong.evaluation.tabulate import as_text, spread
 
 
@@ -157,6 +167,41 @@ def test_precision_is_over_what_is_returned_and_recall_over_all(tmp_path):
     assert line["recall_percent"] == pytest.approx(33.33)
     draw_coarse(rows, coarse.summary(rows), tmp_path / "x.png")
     assert (tmp_path / "x.png").stat().st_size > 5000
+
+
+def object_rows():
+    answers = (("a", False, "ok", 1.0, 1.0), ("b", True, "ok", 90.0, 2.0),
+               ("c", False, "ambiguous", 180.0, 180.0))  # fmt: skip
+    for shape, has_symmetry, status, rre, like in answers:
+        row = {"level": "L1", "motion": "any", "method": "ours", "status": status}
+        row |= {"has_symmetry": has_symmetry, "rre_deg": rre, "rre_symmetric_deg": like}
+        row |= {"rte": 0.0, "rte_symmetric": 0.0, "is_correct": rre < 5.0}
+        row |= {"is_correct_symmetric": like < 5.0, "is_listed": True, "seconds": 1.0}
+        yield {"seed": 0, "part": "pairs", "shape": shape, **row}
+        step = {"level": "L1", "method": "ours", "is_correct": rre < 5.0}
+        for most in (1, 10):
+            yield {"seed": 0, "part": "iterations", "most_iterations_per_level": most, **step}
+
+
+def test_objects_count_with_and_without_their_symmetries(tmp_path):
+    rows = list(object_rows())
+    table = objects.object_lines([row for row in rows if row["part"] == "pairs"])
+    whole, lopsided = table
+    assert (whole["n"], whole["returned"], whole["ambiguous"], whole["wrong"]) == (3, 2, 1, 0)
+    assert (whole["precision_percent"], whole["recall_percent"]) == (50.0, 33.33)
+    assert whole["precision_symmetric_percent"] == whole["recall_symmetric_percent"] == 100.0
+    assert (whole["rre_median_deg"], whole["rre_symmetric_median_deg"]) == (90.0, 2.0)
+    assert (lopsided["shapes"], lopsided["n"], lopsided["rre_mean_deg"]) == ("no symmetry", 2, 90.5)
+    draw_objects(rows, table, tmp_path / "x.png")
+    assert (tmp_path / "x.png").stat().st_size > 5000
+
+
+def test_objects_without_an_archive_are_generated_in_the_unit_sphere():
+    shapes = objects.shapes_of(Setting())
+    assert list(shapes) == ["stele", "lion", "burner"]
+    for points in shapes.values():
+        assert np.linalg.norm(points, axis=1).max() == pytest.approx(1.0)
+        assert len(points) >= 2 * 1024
 
 
 def test_sizes_go_up_to_the_largest_two_a_decade():

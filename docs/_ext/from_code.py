@@ -2,7 +2,7 @@
 
 ``{parameters} MODULE:MODEL TABLE`` lists the fields of a parameter set and of those within it;
 ``{commands}`` every command and its options; ``{reasons}`` the reason codes of removed points;
-``{evidence} STUDY [KEY=VALUE]`` the table of a study that was run, or how to run it; ``{bench}``
+``{evidence} STUDY`` the table of a study that was run, or how to run it; ``{bench}``
 that of the speed measurements; ``{large-site}`` those of runs larger than memory.
 """
 
@@ -207,15 +207,11 @@ class Reasons(Written):
 
 
 class Evidence(Written):
-    """The table of a study as it was run: ``{evidence} STUDY``.
-
-    ``{evidence} STUDY KEY=VALUE``: its rows of that value alone, without the columns that say
-    nothing of them. The figure and who measured stand where the first of the table's rows are.
-    """
+    """The table of a study as it was run: ``{evidence} STUDY``."""
 
     required_arguments = 1
 
-    def markdown(self, study: str, wanted: str = "") -> Iterator[str]:
+    def markdown(self, study: str) -> Iterator[str]:
         """Yield who measured what where, and the study's table."""
         path = EVIDENCE / f"{study}.json"
         self.env.note_dependency(str(path))
@@ -224,12 +220,10 @@ class Evidence(Written):
             yield ""
             return
         document = json.loads(path.read_text(encoding="utf-8"))
-        part = _part(document["table"], wanted)
-        if part and part[0] is document["table"][0]:
-            yield from _provenance(study, document)
-            if path.with_suffix(".png").is_file():
-                yield from (f"![{study}](evidence/{study}.png)", "")
-        rows, note = _shown_rows(part if not wanted else _said(part))
+        yield from _provenance(study, document)
+        if path.with_suffix(".png").is_file():
+            yield from (f"![{study}](evidence/{study}.png)", "")
+        rows, note = _shown_rows(document["table"])
         columns = list(dict.fromkeys(key for row in rows for key in row))
         cells = [[_cell(row.get(key)) for key in columns] for row in rows]
         yield from table([column.replace("_", " ") for column in columns], cells)
@@ -247,18 +241,6 @@ class Bench(Written):
         yield from (*as_markdown(document).splitlines(), "")
         yield from ("Everyone who was asked, and what they answered:", "")
         yield from (*as_markdown_all(document).splitlines(), "")
-
-
-def _part(rows: Sequence[dict[str, Any]], wanted: str) -> Sequence[dict[str, Any]]:
-    """Return the rows where KEY is VALUE by ``KEY=VALUE``; all rows by nothing."""
-    key, _, value = wanted.partition("=")
-    return [row for row in rows if str(row.get(key)) == value] if wanted else rows
-
-
-def _said(rows: Sequence[dict[str, Any]]) -> Sequence[dict[str, Any]]:
-    """Return rows without the columns that are empty, or the same in all of them."""
-    keys = [key for key in rows[0] if len({str(row.get(key)) for row in rows}) > 1] if rows else []
-    return [{key: row.get(key) for key in keys} for row in rows]
 
 
 class LargeSite(Written):
