@@ -134,6 +134,9 @@ def test_the_study_is_a_command(tmp_path, capsys, monkeypatch):
     said = json.loads(capsys.readouterr().out)
     written = json.loads((tmp_path / "s" / "denoise.json").read_text(encoding="utf-8"))
     assert said["table"] == written["table"]
+    everything = {row["filter"]: row for row in written["table"] if row["sample"] == "all"}
+    assert everything["CWASF protective"]["separable_isolated_percent"] > 95
+    assert everything["CWASF protective"]["separable_clustered_percent"] > 80
     assert {row["sample"] for row in written["rows"]} == {"facade, scan"}
     table = (tmp_path / "s" / "denoise.csv").read_text(encoding="utf-8").splitlines()
     assert len(table) == 1 + len(said["table"])

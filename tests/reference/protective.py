@@ -137,11 +137,15 @@ def judge(points, alpha, gamma, limits, rule, reach=0.5):
         reached = []
         for j in near[i]:
             part = axes[j].T @ (points[i] - points[j])
-            reached.append(np.linalg.norm(part / (1.0, divisors[j, 0], divisors[j, 1])) / usual[j])
+            lift = 1.0 + rule.CHARGE * (divisors[j, 0] - 1.0)
+            protected = part * (lift, 1.0, 1.0) / (1.0, divisors[j, 0], divisors[j, 1])
+            reached.append(np.linalg.norm(protected) / usual[j])
             if np.linalg.norm(part / (1, 1, divisors[j, 2])) <= LINK * max(usual[i], usual[j]):
                 links.append((i, j))
-        if len(reached) >= rule.TESTS:
-            margin[i] = (np.sort(reached)[: rule.TESTS] / limits).max()
+        found = np.sort(reached)[: rule.TESTS]
+        margin[i] = (found / limits[: len(found)]).max(initial=0.0)
+        if len(found) < rule.TESTS:
+            margin[i] = max(margin[i], 1.0 + reach / (usual[i] * limits[len(found)]))
     group = pieces_joined(groups(links, n), points, usual, table, reach)
     extent = {g: np.ptp(points[group == g], axis=0).max() for g in set(group.tolist())}
     held = {g: (group == g).sum() for g in extent}

@@ -39,11 +39,11 @@ class CurvatureWeighted(Parameters):
     of the points in the ball round each point; ``global``, those of the whole cloud. ``protective``
     uses alpha, gamma, surface_loss and reach_m; radii, beta, curvature_0 and tau are the others'.
     """
-    surface_loss: Annotated[float, Field(gt=0, lt=0.5)] = 0.025
+    surface_loss: Annotated[float, Field(gt=0, lt=0.5)] = 0.015
     """``protective``: share of the points of a randomly sampled surface that each of its distance
     tests would take if nothing excused them. More removes more."""
     reach_m: Annotated[float, Field(gt=0)] | None = None
-    """``protective``: nothing farther is a neighbour; the halo is 13 times this. None: 0.5 m,
+    """``protective``: nothing farther is a neighbour; the halo is 17 times this. None: 0.5 m,
     doubled or halved until it is 5 to 100 median spacings of the cloud."""
     radius_init_m: Annotated[float, Field(gt=0)] = 0.3
     """Radius of the ball that curvature and local statistics are taken from."""
@@ -224,7 +224,7 @@ def curvature_weighted(
     ``paper`` and ``global`` round coordinates to 2**-18 m (for 0.3 m) and sum exact integers, so
     nothing depends on the order of the points. The cost of an exact ball grows with the square root
     of the points in it, that of a fast one does not.
-    Tile class: local, with the halo of `halo_m` (``protective`` with a reach_m: 13 of it;
+    Tile class: local, with the halo of `halo_m` (``protective`` with a reach_m: 17 of it;
     ``paper``: 2 radius_init_m + radius_max_m, fast 0.22 radius_init_m more); ``global`` is
     two-pass.
     """

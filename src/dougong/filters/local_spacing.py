@@ -10,9 +10,11 @@ from dougong.filters.octree_voxel_grid import runs_of_cells
 from dougong.threads import for_blocks
 from dougong.typing import Index, Points, Values
 
-NEAR_CELLS, FAR_CELLS = 0.5, 1.0
-"""Cells, in reaches, in which the spacing is averaged: out to 1.5 cells round a point."""
-FEW = 50.0
+NEAR_CELLS, FAR_CELLS = 0.5, 2.0
+"""Cells, in reaches, in which the spacing is averaged: out to 1.5 cells round a point. The far ones
+must show a flock that hovers before a wall the wall: no group smaller than its gap is taken for
+small beyond two reaches."""
+FEW = 25.0
 """The far average counts like this many near points."""
 STEPS = 1 << 16
 """Steps per unit in which logarithms are summed, exactly."""

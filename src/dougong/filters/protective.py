@@ -2,9 +2,9 @@
 
 docs/denoising.md has the reasoning and what it was measured on. In short: the spacing that
 scans have hereabouts is the yardstick; a neighbour's distance is divided along the surface or the
-line it lies on, never inflated; the first to eighth nearest are tested together, so that pairs do
-not vouch for each other; groups that are smaller than their distance from everything large go;
-rows that chance does not make stay.
+line it lies on, and counts a little more across a plane; the first to eighth nearest are tested
+together, so that pairs do not vouch for each other; groups that are smaller than their distance
+from everything large go; rows that chance does not make stay.
 Kernels are imported when called.
 """
 
@@ -35,6 +35,9 @@ REACH_M = 0.5
 SPARSE, DENSE = 5.0, 50.0
 """Median spacings that the reach must hold, and may hold before it is halved: 0.5 m serves from
 100 to 10,000 points/m2. In a longer reach scattered noise would have a spacing of its own."""
+CHARGE = 0.25
+"""Of what is excused along a plane, so much is charged across it: where all round lies in a plane,
+a spacing off it is no accident of sampling."""
 ROW_NEIGHBOURS, ROW_WIDTH, ROW_ACCIDENTS = 24, 0.5, 1e-3
 """A point stays if, among this many nearest of those that would go, a row (this many spacings to
 either side) has so many that chance would make fewer than this number of such rows there."""
@@ -57,6 +60,10 @@ class Taken(IntEnum):
     """It belongs to a group that is smaller than its distance from everything large."""
 
 
+_REASONS = np.array([Taken.ALONE, Taken.OFF_SURFACE] + (TESTS - 1) * [Taken.IN_PAIR], np.uint8)
+"""By the number of the nearest that is too far; 0: too few are in reach."""
+
+
 class Whole(NamedTuple):
     """What the rule must know of a whole cloud to judge a part of it, its halo included."""
 
@@ -73,7 +80,7 @@ class Verdict(NamedTuple):
     """What the rule says about n points, in the caller's order."""
 
     margin: Values
-    """(n,) above 1: removed; inf: alone."""
+    """(n,) above 1: removed. Alone: 1 + the least that the first neighbour out of reach has."""
     reason: NDArray[np.uint8]
     """(n,) `Taken`."""
     spacing_m: Values
@@ -170,12 +177,14 @@ def judge(
         )
 
     def test(start: int, stop: int) -> None:
-        kernels.support(index.points, places, frame, spacing, limits, start, stop, margin, decisive)
+        kernels.support(
+            index.points, places, frame, spacing, limits, reach, CHARGE, start, stop,
+            margin, decisive,
+        )  # fmt: skip
 
     for_blocks(n, _BLOCK, see)
     for_blocks(n, _BLOCK, test)
-    reason = np.where(decisive == 1, Taken.OFF_SURFACE, Taken.IN_PAIR).astype(np.uint8)
-    reason[~np.isfinite(margin)] = Taken.ALONE
+    reason = _REASONS[decisive]
     parent = np.arange(n)
     kernels.link(index.points, places, frame, spacing, LINK, parent)
     lonely, groups = group_margin(
@@ -188,7 +197,8 @@ def judge(
         is_whole=is_whole,
     )
     is_worse = lonely > margin
-    margin[is_worse], reason[is_worse] = lonely[is_worse], Taken.SMALL_GROUP
+    margin[is_worse] = lonely[is_worse]
+    reason[is_worse & (decisive > 0)] = Taken.SMALL_GROUP
     _excuse_rows(index, spacing, reach, margin)
     if whole.is_few:
         margin[:] = 0.0

@@ -134,6 +134,8 @@ def support(
     frame: Singles,
     spacing: Floats,
     limits: Floats,
+    reach: float,
+    charge: float,
     start: int,
     stop: int,
     margin: Floats,
@@ -142,7 +144,9 @@ def support(
     """Fill margin (n,) and decisive (n,) for sorted points start .. stop - 1.
 
     margin: the largest over k of (k-th least protected distance) / limits[k - 1], distances being
-    divided by the spacing (n,) round the neighbour; above 1 is too far. decisive: that k.
+    divided by the spacing (n,) round the neighbour; above 1 is too far. decisive: that k. What is
+    excused along a plane is charged across it, times `charge`. Where fewer are in reach than there
+    are limits, decisive is 0 and the margin 1 plus what the first missing one has at least.
     """
     tests = limits.shape[0]
     best = np.empty(tests, np.float64)
@@ -153,7 +157,9 @@ def support(
             if j < 0:
                 break
             up, across, along = _parts2(points, frame, i, j)
-            d2 = up + across / (frame[j, 6] * frame[j, 6]) + along / (frame[j, 7] * frame[j, 7])
+            lift = 1.0 + charge * (frame[j, 6] - 1.0)
+            d2 = lift * lift * up
+            d2 += across / (frame[j, 6] * frame[j, 6]) + along / (frame[j, 7] * frame[j, 7])
             d2 /= spacing[j] * spacing[j]
             if d2 >= best[tests - 1]:
                 continue
@@ -164,6 +170,10 @@ def support(
             best[at] = d2
         margin[i] = -1.0
         for k in range(tests):
+            if best[k] == np.inf:
+                margin[i] = max(margin[i], 1.0 + reach / (spacing[i] * limits[k]))
+                decisive[i] = 0
+                break
             ratio = math.sqrt(best[k]) / limits[k]
             if ratio > margin[i]:
                 margin[i] = ratio

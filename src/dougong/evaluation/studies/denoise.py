@@ -19,7 +19,7 @@ from dougong.evaluation.denoise import (
     scores,
     summary,
 )
-from dougong.evaluation.denoise_noise import Pattern, Sample, make_sample
+from dougong.evaluation.denoise_noise import NOISE_KINDS, Pattern, Sample, make_sample
 from dougong.evaluation.denoise_real import real_samples
 from dougong.evaluation.denoise_shapes import SHAPES
 from dougong.evaluation.studies import Findings, Setting
@@ -29,13 +29,14 @@ PATTERNS: tuple[Pattern, ...] = ("poisson", "gradient", "scan")
 RUNS, QUICK_RUNS = 10, 1
 QUICK_SHAPES, QUICK_DENSITY = ("facade", "tiles", "statue"), 0.3
 COLUMNS = ("noise", "separable", "feature", "flat", "worst_patches", "vegetation")
+BY_KIND = tuple(f"separable_{kind}" for kind in NOISE_KINDS.values())
 
 
 def study(setting: Setting, progress: Progress) -> Findings:
     """Run every filter on every sample.
 
     Six pieces, each sampled at random, with a density gradient and as a scan, drawn anew in every
-    run with 3 % noise; with a data folder also its clouds with noise added.
+    run with 3 % noise; with a data folder also its buildings and clouds with noise added.
     """
     rows: list[dict[str, Any]] = []
     for run, sample in _samples(setting):
@@ -76,11 +77,14 @@ def _table(measured: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     table = []
     for name in [*dict.fromkeys(row["sample"] for row in measured), "all"]:
         chosen = [row for row in measured if name in (row["sample"], "all")]
+        kinds = summary(chosen, "filter", BY_KIND)
         for method, cells in summary(chosen, "filter", COLUMNS).items():
             line: dict[str, Any] = {"sample": name, "filter": method}
             for column, (mean, spread) in zip(COLUMNS, cells, strict=True):
                 line[f"{column}_percent"] = None if np.isnan(mean) else round(mean, 2)
                 line[f"{column}_spread"] = None if np.isnan(spread) else round(spread, 2)
+            for column, (mean, _) in zip(BY_KIND, kinds[method], strict=True):
+                line[f"{column}_percent"] = None if np.isnan(mean) else round(mean, 2)
             table.append(line)
     return table
 
@@ -101,7 +105,17 @@ def _text(measured: Sequence[Mapping[str, Any]]) -> str:
             for mean, spread in cells
         )
         lines.append(f"{name:24s}{shown}")
-    return "\n".join(lines)
+    return "\n".join([*lines, "", *_by_kind(measured)])
+
+
+def _by_kind(measured: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield the lines of a table of separable noise removed, by its kind."""
+    yield "Separable noise removed, percent, by its kind."
+    yield ""
+    yield f"{'':24s}" + "".join(f"{kind:>12s}" for kind in NOISE_KINDS.values())
+    for name, cells in summary(measured, "filter", BY_KIND).items():
+        shown = "".join(f"{'-':>12s}" if np.isnan(mean) else f"{mean:12.1f}" for mean, _ in cells)
+        yield f"{name:24s}{shown}"
 
 
 def draw_curves(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
