@@ -331,6 +331,29 @@ def test_protective_says_why_it_removes():
     assert (chosen.attributes["removal_margin"][len(surface) :] > 1).all()
 
 
+def test_protective_measures_a_sparse_flock_by_the_wall_behind_it():
+    """A passer-by's fringe, longer than the far limit of groups and a metre before the wall."""
+    fringe = np.random.default_rng(1).normal([2, -1.1, 2], [0.15, 0.12, 0.45], (60, 3))
+    chosen = curvature_weighted(np.concatenate([wall(16 * 900, 2), fringe]), PROTECTIVE)
+    assert chosen.is_kept[:-60].mean() > 0.999
+    assert chosen.is_kept[-60:].mean() < 0.05
+    # Once there are many of them they are a thing of their own density.
+    cloud = np.random.default_rng(2).normal([2, -1.1, 2], [0.3, 0.3, 0.5], (3000, 3))
+    chosen = curvature_weighted(np.concatenate([wall(16 * 900, 2), cloud]), PROTECTIVE)
+    assert chosen.is_kept[-3000:].mean() > 0.7
+
+
+def test_protective_ranks_points_alone_by_how_lonely_they_are():
+    surface = wall(16 * 900, 2)
+    near, far = [[2.0, -0.9, 2.0]], [[2.0, -4.0, 2.0]]
+    four = np.random.default_rng(3).normal([1.0, -3.0, 1.0], 0.05, (4, 3))
+    chosen = curvature_weighted(np.concatenate([surface, near, far, four]), PROTECTIVE)
+    margin = chosen.attributes["removal_margin"]
+    assert (chosen.attributes["removal_reason"][-6:] == protective.Taken.ALONE).all()
+    assert np.isfinite(margin).all()
+    assert (margin[-6:-4] > margin[-4:].max()).all()
+
+
 def test_protective_keeps_brackets_and_walls_of_the_facade():
     points, labels = bracketed_facade(300.0, 0.02, 0)
     noise, feature, flat = rates(curvature_weighted(points, PROTECTIVE).is_kept, labels)
