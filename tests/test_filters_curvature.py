@@ -343,6 +343,23 @@ def test_protective_measures_a_sparse_flock_by_the_wall_behind_it():
     assert chosen.is_kept[-3000:].mean() > 0.7
 
 
+def test_protective_keeps_what_shows_a_surface_and_takes_what_was_stirred_up():
+    """A stele 0.8 m tall and a flock of as many points, each two metres before the wall."""
+    rng = np.random.default_rng(4)
+    height, side = rng.uniform(0, 0.8, 400), rng.uniform(-0.12, 0.12, 400)
+    c, s = np.array([[1, 0, -1, 0], [0, 1, 0, -1]])[:, rng.integers(0, 4, 400)]
+    stele = np.stack([1.0 + 0.12 * c - side * s, 0.12 * s + side * c - 2.2, height], axis=1)
+    stele += rng.normal(0, 0.002, (400, 3))
+    flock = rng.normal([3.0, -2.2, 0.8], 0.1, (400, 3))
+    again = np.repeat([[0.5, -2.0, 3.0]], 200, axis=0)
+    chosen = curvature_weighted(
+        np.concatenate([wall(16 * 900, 2), stele, flock, again]), PROTECTIVE
+    )
+    is_kept = chosen.is_kept[16 * 900 :]
+    assert is_kept[:400].mean() > 0.97
+    assert is_kept[400:].mean() < 0.05
+
+
 def test_protective_ranks_points_alone_by_how_lonely_they_are():
     surface = wall(16 * 900, 2)
     near, far = [[2.0, -0.9, 2.0]], [[2.0, -4.0, 2.0]]

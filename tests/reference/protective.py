@@ -6,7 +6,7 @@ import numpy as np
 from scipy.stats import binom
 
 from dougong.filters import local_spacing
-from dougong.filters.groups import BETWEEN, GROUP, LINK, MANY, PIECE
+from dougong.filters.groups import BETWEEN, FLAT, GROUP, LINK, MANY, PIECE, SOLID
 from reference.filters import distances
 
 
@@ -31,8 +31,8 @@ def spacing(points, own, edge):
 
 
 def frames(points, order, table, alpha, gamma, reach, neighbours, usual, stretch):
-    """Return neighbours, axes (n, 3, 3) by rising variance and divisors (n, 3)."""
-    near, axes, divisors = [], [], []
+    """Return neighbours, variation (n,), axes (n, 3, 3) by rising variance, divisors (n, 3)."""
+    near, axes, divisors, variation = [], [], [], np.zeros(len(points))
     for i in range(len(points)):
         mine = [j for j in order[i, :neighbours] if table[i, j] <= reach]
         near.append(mine)
@@ -43,6 +43,7 @@ def frames(points, order, table, alpha, gamma, reach, neighbours, usual, stretch
             continue
         values, vectors = np.linalg.eigh(np.cov(group.T, bias=True))
         least, middle = np.maximum(values[:2], 0) / values.sum()
+        variation[i] = least
         flat, line = 1 - math.tanh(gamma * least), 1 - math.tanh(gamma * (least + middle))
         axes.append(vectors)
         excuse = 1 + alpha * line
@@ -50,7 +51,7 @@ def frames(points, order, table, alpha, gamma, reach, neighbours, usual, stretch
             pitch = math.sqrt(12 * max(values[2], 0) / (len(group) ** 2 - 1))
             excuse = max(excuse, line * stretch * pitch / usual[i])
         divisors.append((1 + alpha * flat * (1 - line), max(1 + alpha * flat, excuse), excuse))
-    return near, np.array(axes), np.array(divisors)
+    return near, variation, np.array(axes), np.array(divisors)
 
 
 def groups(links, n):
@@ -66,18 +67,15 @@ def groups(links, n):
     return group
 
 
-def pieces_joined(group, points, usual, table, reach):
+def pieces_joined(group, points, usual, table, are_large):
     """Return the group number (n,) after pieces of one thing became one group."""
     members = {g: group == g for g in set(group.tolist())}
     size = {
         g: max(usual[m].mean() * math.sqrt(m.sum()), np.ptp(points[m], axis=0).max())
         for g, m in members.items()
     }
-    pieces = [
-        g
-        for g, m in members.items()
-        if PIECE < m.sum() < MANY and np.ptp(points[m], axis=0).max() <= GROUP * reach
-    ]
+    large = are_large(group)
+    pieces = [g for g, m in members.items() if m.sum() > PIECE and not large[g]]
     joined = group.copy()
     for a in pieces:
         for b in pieces:
@@ -131,7 +129,7 @@ def judge(points, alpha, gamma, limits, rule, reach=0.5):
     _, far_log = spacing(points, own, local_spacing.FAR_CELLS * reach)
     usual = np.exp2((held * near_log + local_spacing.FEW * far_log) / (held + local_spacing.FEW))
     args = (alpha, gamma, reach, rule.NEIGHBOURS, usual, math.pi / 2 * limits[-1])
-    near, axes, divisors = frames(points, order, table, *args)
+    near, variation, axes, divisors = frames(points, order, table, *args)
     margin, links = np.full(n, np.inf), []
     for i in range(n):
         reached = []
@@ -146,10 +144,19 @@ def judge(points, alpha, gamma, limits, rule, reach=0.5):
         margin[i] = (found / limits[: len(found)]).max(initial=0.0)
         if len(found) < rule.TESTS:
             margin[i] = max(margin[i], 1.0 + reach / (usual[i] * limits[len(found)]))
-    group = pieces_joined(groups(links, n), points, usual, table, reach)
+
+    def are_large(group):
+        large = {}
+        for g in set(group.tolist()):
+            extent = np.ptp(points[group == g], axis=0).max()
+            flat = ((group == g) & (variation < FLAT)).sum()
+            is_solid = flat >= SOLID and extent > 0
+            large[g] = extent > GROUP * reach or (group == g).sum() >= MANY or is_solid
+        return large
+
+    group = pieces_joined(groups(links, n), points, usual, table, are_large)
+    is_large = are_large(group)
     extent = {g: np.ptp(points[group == g], axis=0).max() for g in set(group.tolist())}
-    held = {g: (group == g).sum() for g in extent}
-    is_large = {g: extent[g] > GROUP * reach or held[g] >= MANY for g in extent}
     large = np.array([is_large[g] for g in group])
     for g in set(group.tolist()):
         mine = group == g

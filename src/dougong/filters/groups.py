@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dougong.filters.clusters import distance_to
 from dougong.filters.local_spacing import SMALLEST_M, STEPS
@@ -23,6 +22,9 @@ GROUP = 2.0
 """A group that extends farther than this many reaches is large; a wider gap is taken as this."""
 MANY = 1000
 """A group of so many points is large: whatever it is, it was scanned, not stirred up."""
+FLAT, SOLID = 0.03, 100
+"""And one of so many points whose surface variation is less than this: they show a surface or a
+line, while of points that were stirred up one in a thousand is so flat."""
 PIECE = 8
 """A group of more points than this is a piece of something, ..."""
 BETWEEN = 0.5
@@ -45,6 +47,8 @@ class _Sizes(NamedTuple):
     """(n,) the root of each point's group."""
     held: Index
     """(n,) points."""
+    flat: Index
+    """(n,) of them, those on a surface or a line."""
     longest: Values
     """(n,) longest side of the box, metres."""
     size: Values
@@ -53,13 +57,16 @@ class _Sizes(NamedTuple):
 
     def are_large(self, limit_m: float, many: int) -> Mask:
         """Say which roots (n,) are those of large groups."""
-        return (self.longest > limit_m) | (self.held >= many)
+        # One place held many times over shows no surface.
+        is_solid = (self.flat >= SOLID) & (self.longest > 0.0)
+        return (self.longest > limit_m) | (self.held >= many) | is_solid
 
 
 def group_margin(
     index: Neighbourhood,
     parent: Index,
     spacing: Values,
+    variation: Values,
     *,
     limit_m: float,
     many: int,
@@ -76,6 +83,8 @@ def group_margin(
         The root of each point's group of linked points.
     spacing : ndarray, shape (n,)
         Metres.
+    variation : ndarray, shape (n,)
+        Surface variation of each point's neighbourhood.
     limit_m, many
         A group that is longer, or has so many points, is large; no wider gap is looked across.
     own : int
@@ -84,8 +93,9 @@ def group_margin(
         The points are a whole cloud. Where no group is large, the one of most points then is: a
         small thing alone is what was scanned.
     """
-    sizes = _sizes_of(index, parent, spacing)
-    sizes = _with_pieces_joined(index, sizes, spacing, sizes.are_large(limit_m, many))
+    is_flat = variation < FLAT
+    sizes = _sizes_of(index, parent, spacing, is_flat)
+    sizes = _with_pieces_joined(index, sizes, spacing, is_flat, sizes.are_large(limit_m, many))
     is_large = sizes.are_large(limit_m, many)
     mine = sizes.parent[index.order < own]
     groups = Groups(bool(is_large[mine].any()), int(sizes.held[mine].max(initial=0)))
@@ -102,7 +112,7 @@ def group_margin(
     return margin, groups
 
 
-def _sizes_of(index: Neighbourhood, parent: Index, spacing: Values) -> _Sizes:
+def _sizes_of(index: Neighbourhood, parent: Index, spacing: Values, is_flat: Mask) -> _Sizes:
     from dougong.kernels import protective as kernels
 
     n = len(parent)
@@ -115,11 +125,12 @@ def _sizes_of(index: Neighbourhood, parent: Index, spacing: Values) -> _Sizes:
     longest[is_root] = (boxes[is_root, 3:] - boxes[is_root, :3]).max(axis=1)
     usual = sums[is_root] / held[is_root] * (SMALLEST_M / STEPS)
     size[is_root] = np.maximum(usual * np.sqrt(held[is_root]), longest[is_root])
-    return _Sizes(parent, held, longest, size)
+    flat = np.bincount(parent[is_flat], minlength=n)
+    return _Sizes(parent, held, flat, longest, size)
 
 
 def _with_pieces_joined(
-    index: Neighbourhood, sizes: _Sizes, spacing: Values, is_large: NDArray[np.bool_]
+    index: Neighbourhood, sizes: _Sizes, spacing: Values, is_flat: Mask, is_large: Mask
 ) -> _Sizes:
     """Return the groups after those small ones that are pieces of one thing became one."""
     from dougong.kernels import clusters as kernels
@@ -136,4 +147,4 @@ def _with_pieces_joined(
     kernels.link_within(tree.points, tree.boxes, gap, float(gap.min()), joined)
     parent = sizes.parent.copy()
     parent[at] = at[joined]
-    return _sizes_of(index, parent, spacing)
+    return _sizes_of(index, parent, spacing, is_flat)

@@ -191,6 +191,7 @@ def judge(
         index,
         parent,
         spacing,
+        curvature,
         limit_m=GROUP * whole.reach_m,
         many=whole.many,
         own=whole.own,
