@@ -32,7 +32,8 @@ better, however little the points scatter."""
 _UNRESOLVED = 0.75
 """The same share for what contradicts: a sheet half a gap thick is no contradiction."""
 _CONTRADICTED = 4.0
-"""What a contradicted point costs beyond one that finds nothing; a match gains 1."""
+"""What a contradicted point costs beyond one that finds nothing; a match gains 1. Of 69 half-seen
+pairs of ModelNet40 3 to 6 rank as many right; from 4 on no wrong pose leads by three sigmas."""
 _NEAR_GAPS = 4.0
 _ONE_SIDED, _ONE_SIDED_WIDTH = 0.8, 0.15
 _MOST_OF_IT = 0.8

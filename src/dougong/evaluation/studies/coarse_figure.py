@@ -21,6 +21,18 @@ def draw_coarse(rows: Rows, table: Rows, path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
+def beside(panel: Any, columns: int) -> None:
+    """Put the legend above the panel, where it hides nothing."""
+    panel.legend(
+        fontsize=7,
+        ncol=columns,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        frameon=False,
+        handlelength=3,
+    )
+
+
 def draw_rates(panel: Any, table: Rows, by: tuple[str, ...] = ("on",)) -> None:
     """Draw how often the best pose is correct after the fine fit, per method and group."""
     groups = distinct(table, *by)
@@ -37,7 +49,7 @@ def draw_rates(panel: Any, table: Rows, by: tuple[str, ...] = ("on",)) -> None:
     panel.tick_params(labelsize=8)
     panel.set_ylim(0, 105)
     panel.set_ylabel("best pose is correct after the fine fit, percent", fontsize=9)
-    panel.legend(fontsize=7, loc="lower left")
+    beside(panel, 3)
 
 
 def _draw_iterations(panel: Any, rows: Rows) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dougong.evaluation.studies.coarse_figure import draw_rates
+from dougong.evaluation.studies.coarse_figure import beside, draw_rates
 from dougong.evaluation.tabulate import chosen, distinct, new_figure, numbers
 
 Rows = Sequence[Mapping[str, Any]]
@@ -15,7 +15,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 def draw_objects(rows: Rows, table: Rows, path: Path) -> None:
     """Draw how often each method's best pose is right, how fast it gets there, and its errors."""
-    figure = new_figure(13.0, 4.4)
+    figure = new_figure(13.0, 5.0)
     panels = figure.subplots(1, 3)
     draw_rates(panels[0], chosen(table, shapes="all"), ("level", "motion"))
     _draw_object_iterations(panels[1], chosen(rows, part="iterations"))
@@ -43,7 +43,7 @@ def _draw_object_iterations(panel: Any, rows: Rows) -> None:
     panel.set_xlabel("most fine iterations per reach, from the first coarse pose", fontsize=9)
     panel.set_ylabel("shapes without symmetry: correct, percent", fontsize=9)
     panel.grid(alpha=0.3)
-    panel.legend(fontsize=6, ncol=2)
+    beside(panel, 3)
 
 
 def _draw_object_errors(panel: Any, rows: Rows) -> None:
@@ -60,4 +60,4 @@ def _draw_object_errors(panel: Any, rows: Rows) -> None:
     panel.set_xlabel(f"rotation error up to symmetry, degrees ({levels[-1]}, any)", fontsize=9)
     panel.set_ylabel("pairs, percent", fontsize=9)
     panel.grid(alpha=0.3)
-    panel.legend(fontsize=7)
+    beside(panel, 3)
