@@ -48,7 +48,10 @@ from dougong.typing import Index, Points, Transform, Values
 MIN_POINTS = 50
 SAME_DEG = 8.0
 SAME_RADII = 0.08
-"""Refined poses nearer than this, in degrees and RMS radii, are one."""
+"""Starting poses nearer than this, in degrees and RMS radii, are one."""
+ONE_DEG = 4.0
+"""... and refined ones nearer than this angle. A thin thing may fit alike at any tilt in between:
+poses that are farther apart, and not told apart, say that the pose is not well known."""
 
 
 class FreeRotation(Parameters):
@@ -300,7 +303,7 @@ def _judge(views: tuple[View, View], poses: Poses, params: FreeRotation) -> _Jud
     heard = sorted((evidence.hear(court, T) for T in refined), key=lambda h: h.total)
     kept: list[evidence.Testimony] = []
     for one in heard:
-        if not any(fitting.near(one.T, k.T, SAME_DEG, SAME_RADII * radius) for k in kept):
+        if not any(fitting.near(one.T, k.T, ONE_DEG, SAME_RADII * radius) for k in kept):
             kept.append(one)
     block, blocks = evidence.blocks_of(*views)
     is_beaten = [evidence.is_worse(kept[0], k, block, blocks, params.sigmas) for k in kept[1:]]
