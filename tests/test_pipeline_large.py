@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,12 @@ import dougong
 from dougong.cli import call
 from dougong.cloud import Cloud
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid, root_cube
+from dougong.filters.selection import DETAIL
 from dougong.formats.model import Hold
 from dougong.pipeline import memory, reduced
+from dougong.pipeline.movers import Tally
 from dougong.pipeline.result_hash import in_byte_order
+from dougong.pipeline.store import Books
 from dougong.registration.result import Registration
 from dougong.threads import get_threads, set_threads
 
@@ -207,3 +211,20 @@ def test_a_killed_run_ends_as_one_left_alone(folder):
     assert bytes_of(folder / "killed") == bytes_of(folder / "calm")
     left = {path.name for path in folder.iterdir()}
     assert left == {"calm", "killed", "scan.laz", "map.laz"}
+
+
+def test_counting_what_became_of_the_points_holds_few_bytes_of_each():
+    rng, n = np.random.default_rng(0), 20_000_000
+    codes, ground = rng.integers(0, 9, n, np.uint8), rng.integers(0, 3, n, np.uint8)
+    details = {DETAIL: rng.integers(0, 5, n, np.uint8)}
+    books = Books(
+        codes=codes, ground_class=ground, stages=(), notes=(), noticed=(), details=details
+    )
+    tracemalloc.start()
+    tally = Tally.of(books)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # A mask and what it chooses, and a block of whole numbers.
+    assert peak < 2 * n + 50_000_000
+    assert list(tally.reasons.values()) == np.bincount(codes).tolist()
+    assert tally.ground == int(((codes == 0) & (ground == 2)).sum())

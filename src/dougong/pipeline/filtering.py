@@ -33,7 +33,7 @@ from dougong.pipeline.recipes import (
     steps_of,
 )
 from dougong.pipeline.registrations import finite
-from dougong.pipeline.removed import detail_counts
+from dougong.pipeline.removed import detail_counts, ground_kept, reason_counts
 from dougong.pipeline.settings import parse_overrides, updated
 from dougong.pipeline.single import (
     filter_name,
@@ -42,7 +42,7 @@ from dougong.pipeline.single import (
     single_parameters,
     single_steps,
 )
-from dougong.pipeline.steps import GROUND, Filtered
+from dougong.pipeline.steps import Filtered
 from dougong.pipeline.store import Books
 from dougong.pipeline.tiled import (
     TiledJob,
@@ -152,7 +152,7 @@ def filter_file(
             with clock.measure("filter"):
                 filtered = _filtered_on_tiles(input, job, room, places, progress)
             noticed = filtered.noticed
-            hold = Hold(room.tile_points(len(filtered.codes), 0), output.parent)
+            hold = Hold(room.most_points_beside(len(filtered.codes)), output.parent)
             result = _pieces(input, job, filtered, mark)
         else:
             with clock.measure("read"):
@@ -219,8 +219,7 @@ def _filter_document(
     job: FilterJob, filtered: Filtered | Books, written: int, mark: bool
 ) -> Document:
     """Return what the books say of the filter: counts per stage, reasons, parameters."""
-    is_kept = filtered.codes == Reason.KEPT
-    points_in, points_kept = len(is_kept), int(is_kept.sum())
+    points_in, points_kept = len(filtered.codes), reason_counts(filtered.codes)[Reason.KEPT]
     return {
         "kind": job.kind,
         "only": job.only,
@@ -241,7 +240,7 @@ def _filter_document(
             for stage in filtered.stages
         ],
         "reasons": reason_table(filtered),
-        "ground_points": int((is_kept & (filtered.ground_class == GROUND)).sum()),
+        "ground_points": ground_kept(filtered.codes, filtered.ground_class),
         "parameters": job.params.model_dump(mode="json"),
     }
 
@@ -265,11 +264,10 @@ def _filtered_on_tiles(
 def reason_table(filtered: Filtered | Books) -> dict[str, dict[str, Any]]:
     """Return per reason its code in ``dougong_reason`` and the points it took, in detail too."""
     table: dict[str, dict[str, Any]] = {}
-    for reason in Reason:
-        chosen = filtered.codes == reason
-        if not chosen.any():
+    for reason, points in zip(Reason, reason_counts(filtered.codes), strict=True):
+        if not points:
             continue
-        row: dict[str, Any] = {"code": int(reason), "points": int(chosen.sum())}
+        row: dict[str, Any] = {"code": int(reason), "points": points}
         if reason == Reason.CURVATURE_WEIGHTED:
             row["details"] = detail_counts(filtered.codes, filtered.details)
         table[reason.name.lower()] = row

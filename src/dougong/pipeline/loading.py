@@ -170,6 +170,8 @@ class Loader:
                     progress=self.progress,
                 )
             self.store.save(key, books, books.noticed)
+            # They are loaded again below, station by station: never two of them at once.
+            del books
             if self.store.is_temporary:
                 folder.remove()
         for station, raw in enumerate(stations_of(file, split=not entry.registered)):

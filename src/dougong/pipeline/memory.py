@@ -17,8 +17,9 @@ BYTES_PER_WAITING_POINT = 110
 BYTES_PER_REDUCED_POINT = 130
 """Of a cloud on disk, as the registration and the distances hold it."""
 _BYTES_PER_TILE_POINT = 250
-_BYTES_PER_BOOKED_POINT = 7
-"""Of a cloud on tiles, the reason, the ground class and the details of every point are held."""
+_BYTES_PER_BOOKED_POINT = 8
+"""Of a cloud that was on tiles, the reason, the ground class and the details of every point are
+held, and one mask over them."""
 LEAST_TILE_POINTS = 100_000
 _MOST_TILE_POINTS = 20_000_000
 """Larger tiles gain nothing."""
@@ -46,7 +47,15 @@ class Room:
 
     def most_tile_points(self, points: int, waiting: int) -> int | None:
         """Return how many points a tile of a cloud of `points` may have; None: no room for any."""
-        left = self.bytes - tiles_bytes(points, 0, waiting)
+        if tiles_bytes(points, 0, waiting) > self.bytes:
+            return None
+        return self._most_points(self.bytes - tiles_bytes(0, 0, waiting))
+
+    def most_points_beside(self, points: int) -> int:
+        """Return how many points may be worked on while all is held that is known of `points`."""
+        return self._most_points(self.bytes - tiles_bytes(points, 0)) or LEAST_TILE_POINTS
+
+    def _most_points(self, left: float) -> int | None:
         most = int(min(max(left, 0.0) / _BYTES_PER_TILE_POINT, _MOST_TILE_POINTS))
         return most if most >= LEAST_TILE_POINTS else None
 
@@ -75,9 +84,12 @@ class Room:
 
 
 def tiles_bytes(points: int, tile_points: int, waiting: int = 0) -> int:
-    """Return the memory that a cloud of `points` needs on tiles of at most `tile_points`."""
-    held = waiting * BYTES_PER_WAITING_POINT + points * _BYTES_PER_BOOKED_POINT
-    return BASE_BYTES + held + tile_points * _BYTES_PER_TILE_POINT
+    """Return the memory that a cloud of `points` needs on tiles of at most `tile_points`.
+
+    What is known of every point is put together when the last tile is done.
+    """
+    tile, books = tile_points * _BYTES_PER_TILE_POINT, points * _BYTES_PER_BOOKED_POINT
+    return BASE_BYTES + waiting * BYTES_PER_WAITING_POINT + max(tile, books)
 
 
 def registering_bytes(reduced: int, waiting: int) -> int:

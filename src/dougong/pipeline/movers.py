@@ -15,8 +15,8 @@ from dougong.filters.selection import Reason
 from dougong.formats import is_same_crs
 from dougong.pipeline.kept import Kept
 from dougong.pipeline.reduced import Reduced, most_points, reduced
-from dougong.pipeline.removed import detail_counts
-from dougong.pipeline.steps import GROUND, Filtered, StageCount
+from dougong.pipeline.removed import detail_counts, ground_kept, reason_counts
+from dougong.pipeline.steps import Filtered, StageCount
 from dougong.pipeline.store import Books
 from dougong.registration.free_scale import ScaleSearch
 from dougong.typing import Kind
@@ -34,13 +34,12 @@ class Tally:
     @classmethod
     def of(cls, books: Filtered | Books) -> Tally:
         """Count what the filters of one file decided."""
-        counts = np.bincount(books.codes, minlength=len(Reason))
+        counts = zip(Reason, reason_counts(books.codes), strict=True)
         details = detail_counts(books.codes, books.details)
-        is_ground = (books.codes == Reason.KEPT) & (books.ground_class == GROUND)
         return cls(
-            reasons=Counter({reason.name.lower(): int(counts[reason]) for reason in Reason}),
+            reasons=Counter({reason.name.lower(): points for reason, points in counts}),
             details=Counter({name: row["points"] for name, row in details.items()}),
-            ground=int(np.count_nonzero(is_ground)),
+            ground=ground_kept(books.codes, books.ground_class),
         )
 
 

@@ -1,4 +1,4 @@
-"""A sample of what the filters took out, to be looked at: where, and why."""
+"""What the filters took out: counted by reason, and a sample to be looked at."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,10 +10,34 @@ from dougong.cloud import Cloud
 from dougong.filters.protective import Taken
 from dougong.filters.selection import DETAIL, Reason
 from dougong.formats.faults import coordinate_hashes
+from dougong.pipeline.steps import GROUND
 from dougong.typing import Index, Points
 
 MOST = 100_000
 """Removed points of one file (or station) that are kept for looking."""
+
+
+_BLOCK = 1 << 22
+
+
+def reason_counts(codes: NDArray[np.uint8]) -> list[int]:
+    """Return how many points each `Reason` took (or kept), in their order."""
+    return _counted(codes, len(Reason))
+
+
+def _counted(codes: NDArray[np.uint8], kinds: int) -> list[int]:
+    """Return how often each code below `kinds` is there, in blocks: counting widens them."""
+    counts = np.zeros(kinds, np.int64)
+    for start in range(0, len(codes), _BLOCK):
+        counts += np.bincount(codes[start : start + _BLOCK], minlength=kinds)
+    return counts.tolist()
+
+
+def ground_kept(codes: NDArray[np.uint8], ground_class: NDArray[np.uint8]) -> int:
+    """Return how many kept points are ground. Holds one mask."""
+    is_ground = ground_class == GROUND
+    is_ground &= codes == Reason.KEPT
+    return int(np.count_nonzero(is_ground))
 
 
 def detail_counts(
@@ -26,9 +50,9 @@ def detail_counts(
     if DETAIL not in details:
         return {}
     chosen = details[DETAIL][codes == Reason.CURVATURE_WEIGHTED]
-    counts = np.bincount(chosen, minlength=len(Taken))
+    counts = _counted(chosen, len(Taken))
     return {
-        taken.name.lower(): {"code": int(taken), "points": int(counts[taken])}
+        taken.name.lower(): {"code": int(taken), "points": counts[taken]}
         for taken in Taken
         if taken != Taken.KEPT
     }
