@@ -52,7 +52,7 @@ def study(setting: Setting, progress: Progress) -> Findings:
         rows=rows,
         table=_table(measured),
         against="the labels of the generated noise and features, known for every point",
-        text=_text(measured),
+        text="\n".join([_text(measured), "", *_along_the_curve(rows)]),
         draw=lambda path: draw_curves(rows, path),
     )
 
@@ -116,6 +116,21 @@ def _by_kind(measured: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     for name, cells in summary(measured, "filter", BY_KIND).items():
         shown = "".join(f"{'-':>12s}" if np.isnan(mean) else f"{mean:12.1f}" for mean, _ in cells)
         yield f"{name:24s}{shown}"
+
+
+def _along_the_curve(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield the lines of a table of separable noise removed at each feature retention."""
+    curves = [row for row in rows if "curve" in row]
+    yield "Separable noise removed, percent, where each filter is cut to keep so many features."
+    yield ""
+    yield f"{'':24s}" + "".join(f"{100.0 * level:>7g}" for level in LEVELS)
+    for name in dict.fromkeys(row["filter"] for row in curves):
+        chosen = [
+            [point["separable"] for point in row["curve"]]
+            for row in curves
+            if row["filter"] == name
+        ]
+        yield f"{name:24s}" + "".join(f"{mean:7.1f}" for mean in np.nanmean(chosen, axis=0))
 
 
 def draw_curves(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
