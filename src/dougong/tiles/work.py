@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong._boxes import are_within
+from dougong._boxes import are_within, corners_of
 from dougong.errors import InputError
 from dougong.filters import clutter_search
 from dougong.filters.cloth_simulation import UNKNOWN, Cloth, ClothSimulation, classify
@@ -323,11 +323,30 @@ def _nearest_of_all(
             continue
         points = asked_points(job, others[number])
         points = points[~_in_box(points, job.tile, halo_m)]
-        if len(points):
-            more = knn(build_index(points), queries[rows], k)[1]
-            both = np.concatenate([nearest_m[rows], more], axis=1)
-            nearest_m[rows] = np.sort(both, axis=1)[:, :k]
+        for some in _of_like_reach(nearest_m[rows, -1]):
+            asked = rows[some]
+            near = _about(points, queries[asked], float(nearest_m[asked, -1].max()))
+            if len(near):
+                more = knn(build_index(near), queries[asked], k)[1]
+                both = np.concatenate([nearest_m[asked], more], axis=1)
+                nearest_m[asked] = np.sort(both, axis=1)[:, :k]
     return nearest_m
+
+
+def _of_like_reach(reach_m: Values) -> list[NDArray[np.int64]]:
+    """Return the places of reaches (n,) that are alike within a factor of two, group by group.
+
+    One stray that looks far then does not make all the others look at everything.
+    """
+    octave = np.frexp(reach_m)[1]
+    octave[~np.isfinite(reach_m)] = np.iinfo(octave.dtype).max
+    return [np.flatnonzero(octave == one) for one in np.unique(octave)]
+
+
+def _about(points: Points, queries: Points, reach_m: float) -> Points:
+    """Return the points within `reach_m` of the box of the queries."""
+    low, high = corners_of(queries)
+    return points[are_within(points, low - reach_m, high + reach_m)]
 
 
 def _gap(points: Points, tile: Tile) -> Values:
