@@ -7,14 +7,15 @@ when called.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from dougong.filters.clusters import distance_to
 from dougong.filters.local_spacing import SMALLEST_M, STEPS
-from dougong.filters.neighbourhood import Neighbourhood, build_index
 from dougong.typing import Index, Mask, Values
+
+if TYPE_CHECKING:
+    from dougong.filters.neighbourhood import Neighbourhood
 
 LINK = 2.0
 """Points within this many spacings make a group: an even surface holds together from 1.2 on."""
@@ -93,6 +94,8 @@ def group_margin(
         The points are a whole cloud. Where no group is large, the one of most points then is: a
         small thing alone is what was scanned.
     """
+    from dougong.filters.clusters import distance_to
+
     is_flat = variation < FLAT
     sizes = _sizes_of(index, parent, spacing, is_flat)
     sizes = _with_pieces_joined(index, sizes, spacing, is_flat, sizes.are_large(limit_m, many))
@@ -133,6 +136,7 @@ def _with_pieces_joined(
     index: Neighbourhood, sizes: _Sizes, spacing: Values, is_flat: Mask, is_large: Mask
 ) -> _Sizes:
     """Return the groups after those small ones that are pieces of one thing became one."""
+    from dougong.filters.neighbourhood import build_index
     from dougong.kernels import clusters as kernels
 
     is_piece = (sizes.held > PIECE) & ~is_large
