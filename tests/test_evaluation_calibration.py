@@ -162,3 +162,8 @@ def test_a_point_to_point_fit_that_leaves_the_surfaces_is_not_ok():
     assert (plain["status"], plain["is_correct"]) == ("ok", True)
     assert pulled["status"] == "ambiguous"
     assert "point-to-plane" in pulled["reason"]
+
+
+def test_a_true_pose_that_was_heard_beside_itself_is_no_beaten_rival():
+    """A plain rectangle whose ground is cut alike at both ends: `ok`, turned by 180 degrees."""
+    assert measure("rectangle", 100296)["status"] == "ambiguous"

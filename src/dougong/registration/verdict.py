@@ -40,6 +40,8 @@ from dougong.registration.rivals import (
 from dougong.registration.symmetry import in_words, move_between
 from dougong.typing import Mask, Transform, Values
 
+_LEADERS = 2
+"""Of so many headings the best rival is looked at as closely as the winner."""
 _TWIN_M = 0.1
 """Fits that end farther apart than this (95 % of the structure) rest in different places: twice
 what is correct, and more than an unfinished fit lacks."""
@@ -209,6 +211,7 @@ def rule(
         overruled = compare(court, best, winner, params.block_m)
         overruled = overruled if is_beaten(overruled, params) else None
     others = [pose for pose in poses[1:] if not is_same(pose.T, winner.T, at)]
+    others = _looked_at_closely(court, levels, others, icp)
     results = [
         replace(
             compare(court, winner, other, params.block_m),
@@ -233,6 +236,29 @@ def rule(
         violation=violation(court, winner),
         overruled=overruled,
     )
+
+
+def _looked_at_closely(
+    court: Court, levels: tuple[Level, ...], rivals: Sequence[Testimony], icp: Icp
+) -> list[Testimony]:
+    """Return the rivals, the best of each heading moved to where a fit close to it rests better.
+
+    The winner is looked for as closely: a true pose heard half a metre off would lose to a turn of
+    itself.
+    """
+    at = middle_of(court.source.points)
+    found: list[Testimony] = []
+    leaders: list[Testimony] = []
+    for pose in sorted(rivals, key=lambda item: item.total):
+        if len(leaders) < _LEADERS and not any(
+            is_same(pose.T, other.T, at, shift_m=np.inf) for other in leaders
+        ):
+            leaders.append(pose)
+            near = (_refined(court, levels, T, icp) for T in propose_neighbours(court, pose, 2))
+            same = [item for item in near if is_same(item.T, pose.T, at)]
+            pose = min([pose, *same], key=lambda item: item.total)
+        found.append(pose)
+    return found
 
 
 def _told_apart(court: Court, poses: Sequence[Testimony]) -> tuple[Testimony, list[Testimony]]:
