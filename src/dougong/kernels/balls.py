@@ -12,7 +12,7 @@ from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel, summing_kernel
 from dougong.kernels.ball_walk import SHARE, look, make_walk, size_of
 from dougong.kernels.boxtree import LEAF, box_distance2
-from dougong.kernels.moments import eigen3
+from dougong.kernels.moments import add_products, eigen3
 
 _DEPTH = 64
 _CHUNK = 64
@@ -22,16 +22,7 @@ _CHUNK = 64
 @kernel
 def add_point(points: Floats, i: int, out: Ints) -> None:
     """Add x, y, z, xx, yy, zz, xy, xz, yz of point i, whole numbers, to out (9,)."""
-    x, y, z = np.int64(points[i, 0]), np.int64(points[i, 1]), np.int64(points[i, 2])
-    out[0] += x
-    out[1] += y
-    out[2] += z
-    out[3] += x * x
-    out[4] += y * y
-    out[5] += z * z
-    out[6] += x * y
-    out[7] += x * z
-    out[8] += y * z
+    add_products(np.int64(points[i, 0]), np.int64(points[i, 1]), np.int64(points[i, 2]), out)
 
 
 @kernel

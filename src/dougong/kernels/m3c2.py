@@ -5,7 +5,7 @@ import numpy as np
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel
 from dougong.kernels.boxtree import box_distance2
-from dougong.kernels.moments import describe
+from dougong.kernels.moments import add_products, describe
 
 _DEPTH = 64
 _FIRST_ROOM = 256
@@ -20,15 +20,7 @@ def _add_point(points: Floats, i: int, core: Floats, per_m: float, sums: Ints) -
     y = np.int64(np.floor((points[i, 1] - core[1]) * per_m + 0.5))
     z = np.int64(np.floor((points[i, 2] - core[2]) * per_m + 0.5))
     sums[0] += 1
-    sums[1] += x
-    sums[2] += y
-    sums[3] += z
-    sums[4] += x * x
-    sums[5] += y * y
-    sums[6] += z * z
-    sums[7] += x * y
-    sums[8] += x * z
-    sums[9] += y * z
+    add_products(x, y, z, sums[1:])
 
 
 @kernel

@@ -9,6 +9,20 @@ from dougong.kernels._jit import kernel
 
 
 @kernel
+def add_products(x: np.int64, y: np.int64, z: np.int64, out: Ints) -> None:
+    """Add x, y, z, xx, yy, zz, xy, xz, yz to out (9,): sums of whole numbers are exact."""
+    out[0] += x
+    out[1] += y
+    out[2] += z
+    out[3] += x * x
+    out[4] += y * y
+    out[5] += z * z
+    out[6] += x * y
+    out[7] += x * z
+    out[8] += y * z
+
+
+@kernel
 def rotate(a: Floats, v: Floats, p: int, q: int) -> None:
     """Turn the symmetric a (3, 3) and the axes v (columns) so that a[p, q] becomes 0 (Jacobi)."""
     apq = a[p, q]

@@ -63,12 +63,6 @@ def write_registration(folder: Path, stem: str, document: dict[str, Any], ends: 
         write_text(folder / f"{stem}{METASHAPE}", metashape_xml(matrix, ends))
 
 
-def exported(stem: str, folder: Path) -> list[str]:
-    """Return the names of the forms of ``STEM.json`` that lie in `folder`."""
-    suffixes = (CLOUDCOMPARE, PDAL, METASHAPE)
-    return [f"{stem}{suffix}" for suffix in suffixes if (folder / f"{stem}{suffix}").is_file()]
-
-
 def inverse(matrix: Transform) -> Transform:
     """Return the inverse (4, 4) of a similarity."""
     linear = matrix[:3, :3]

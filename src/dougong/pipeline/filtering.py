@@ -219,7 +219,8 @@ def _filter_document(
     job: FilterJob, filtered: Filtered | Books, written: int, mark: bool
 ) -> Document:
     """Return what the books say of the filter: counts per stage, reasons, parameters."""
-    points_in, points_kept = len(filtered.codes), reason_counts(filtered.codes)[Reason.KEPT]
+    reasons = reason_table(filtered)
+    points_in, points_kept = len(filtered.codes), reasons.get("kept", {"points": 0})["points"]
     return {
         "kind": job.kind,
         "only": job.only,
@@ -239,7 +240,7 @@ def _filter_document(
             }
             for stage in filtered.stages
         ],
-        "reasons": reason_table(filtered),
+        "reasons": reasons,
         "ground_points": ground_kept(filtered.codes, filtered.ground_class),
         "parameters": job.params.model_dump(mode="json"),
     }

@@ -43,15 +43,6 @@ _MOST_CELLS = 200_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Tried:
-    """One pair that was registered."""
-
-    source: str
-    target: str
-    result: Registration
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Frames:
     """Where every cloud of a project stands, and the links that hold them."""
 

@@ -56,7 +56,7 @@ def _refuse_full_work_disk(plan: Plan, work: Path, progress: Progress) -> None:
     """
     folder, free = _free(work)
     if plan.sure_work_bytes > free:
-        raise _too_full(folder, free, "the run", plan.sure_work_bytes, "--work")
+        raise _too_full(folder, free, "the run needs", plan.sure_work_bytes, "--work")
     # The bound of the result counts on points that compress badly: half of it is usual.
     most = max(plan.work_bytes, (plan.work_bytes + plan.out_bytes) // 2)
     if most > free:
@@ -85,7 +85,7 @@ def refuse_full_disk_after_filters(
     need = max(s.work_bytes for s in stages_after(left, row_bytes, room, 0, full=full))
     folder, free = _free(work)
     if need > free:
-        raise _too_full(folder, free, "what the filters left", need, "--work")
+        raise _too_full(folder, free, "what the filters left need", need, "--work")
 
 
 def _left(path: str, mover: Mover, points: int, *, is_held: bool) -> PlannedFile:
@@ -113,7 +113,7 @@ def refuse_full_disk(files: Sequence[Path], out: Path) -> None:
     folder, free = _free(out)
     if need > free:
         options = "--out, or leave --full-resolution out"
-        raise _too_full(folder, free, "the clouds at full resolution", need, options)
+        raise _too_full(folder, free, "the clouds at full resolution need", need, options)
 
 
 def _free(path: Path) -> tuple[Path, int]:
@@ -123,8 +123,7 @@ def _free(path: Path) -> tuple[Path, int]:
 
 
 def _too_full(folder: Path, free: int, what: str, need: int, options: str) -> OutputError:
-    verb = "needs" if what == "the run" else "need"
     return OutputError(
-        f"{folder} has {free / 1e9:.3g} GB free, and {what} {verb} about {need / 1e9:.3g} GB. "
+        f"{folder} has {free / 1e9:.3g} GB free, and {what} about {need / 1e9:.3g} GB. "
         f"Free some space or pass another {options}."
     )

@@ -15,8 +15,6 @@ from dougong.typing import Index, Points
 
 MOST = 100_000
 """Removed points of one file (or station) that are kept for looking."""
-
-
 _BLOCK = 1 << 22
 
 
