@@ -1,19 +1,21 @@
 """The proof: what cannot be told apart is said, and a wrong pose is never called ok."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from dougong.registration.decision import decide
 from dougong.registration.evidence import hear, sharpness, summon, support
-from dougong.registration.handedness import handedness
+from dougong.registration.handedness import _mirrored_witness, handedness
 from dougong.registration.icp import Icp, build_levels
 from dougong.registration.prepare import Prepared
 from dougong.registration.result import Hypothesis
 from dougong.registration.rivals import is_same
 from dougong.registration.sanity import mirrored
 from dougong.registration.settings import Register
-from dougong.registration.verdict import Verdict, compare
+from dougong.registration.verdict import Comparison, Verdict, compare, is_beaten
 
 SPACING = 0.25
 
@@ -66,6 +68,16 @@ def turned(deg, shift=(0.0, 0.0, 0.0)):
     T[:3, :3] = Rotation.from_euler("z", deg, degrees=True).as_matrix()
     T[:3, 3] = shift
     return T
+
+
+def part(cloud, is_in):
+    """The chosen points of a prepared cloud."""
+    columns = {
+        field.name: value[is_in]
+        for field in fields(cloud)
+        if isinstance(value := getattr(cloud, field.name), np.ndarray) and len(value) == len(is_in)
+    }
+    return replace(cloud, **columns)
 
 
 def starts(*poses):
@@ -188,6 +200,55 @@ def test_the_mirror_image_of_a_symmetric_house_is_heard(has_barn):
     assert handedness(court, levels, winner, icp, Register().verdict) == "left"
 
 
+# Two wings with their outhouses, each the other's mirror image, and a corridor between them.
+WINGS = (
+    (-16.0, -6.0, 8.0, 12.0, 5.0),
+    (8.0, -6.0, 8.0, 12.0, 5.0),
+    (-8.0, 2.0, 16.0, 4.0, 4.0),
+    (-14.0, -12.0, 4.0, 6.0, 4.0),
+    (10.0, -12.0, 4.0, 6.0, 4.0),
+)
+
+
+def test_a_wing_that_mirrors_the_other_makes_no_file_left_handed():
+    one, two = site(20, *WINGS), site(21, *WINGS)
+    source, target = part(one, one.xyz[:, 0] < 5.0), part(two, two.xyz[:, 0] > -5.0)
+    icp = Icp(levels=2, first_distance_m=1.5, last_distance_m=0.5, points_per_level=3000)
+    court, levels = summon(source, target), build_levels(source, target, icp)
+    winner = hear(court, np.eye(4))
+    assert handedness(court, levels, winner, icp, Register().verdict) == "open"
+
+
+def test_a_mirrored_witness_is_heard_as_the_witness_is():
+    cloud = site(8, *HOUSE, BARN)
+    court = summon(cloud, cloud)
+    mirror_image = replace(
+        court,
+        source=_mirrored_witness(court.source),
+        target=_mirrored_witness(court.target),
+    )
+    pose = turned(20.0, (1.0, 2.0, 0.0))
+    plain, other = hear(court, pose), hear(mirror_image, turned(-20.0, (-1.0, 2.0, 0.0)))
+    # A point on the border of a cell may fall to either side.
+    assert np.mean(plain.is_within != other.is_within) < 1e-3
+    assert np.mean(plain.is_inside != other.is_inside) < 1e-3
+    assert plain.total == pytest.approx(other.total, abs=1e-3)
+
+
+def test_a_larger_difference_may_be_less_rare():
+    def comparison(gain, p_value):
+        return Comparison(T=np.eye(4), gain=gain, p_value=p_value, blocks=9)
+
+    params = Verdict(p_value=1e-3, gain=0.05)
+    assert not is_beaten(comparison(0.049, 1e-9), params)
+    assert is_beaten(comparison(0.05, 1e-3), params)
+    assert not is_beaten(comparison(0.05, 1.1e-3), params)
+    assert is_beaten(comparison(0.1, 3.1e-3), params)
+    assert not is_beaten(comparison(0.1, 3.2e-3), params)
+    assert is_beaten(comparison(0.3, 1e-2), params)
+    assert not is_beaten(comparison(0.3, 1.1e-2), params)
+
+
 def test_blocks_that_disagree_about_the_pose_are_not_ok():
     strict = Register(verdict=Verdict(most_spread_m=0.001))
     found = decide(site(8, *UNLIKE), site(9, *UNLIKE), starts(turned(0.5)), strict)
@@ -200,3 +261,14 @@ def test_what_the_proof_refuses_is_not_fitted():
     found = decide(site(4, *UNLIKE), site(5, *other), starts(turned(30.0)), Register())
     assert found.status == "failed"
     assert found.fine is None
+
+
+def test_too_little_overlap_is_refused_unless_asked():
+    pair = site(8, *UNLIKE), site(9, *UNLIKE)
+    asked = Register(verdict=Verdict(least_overlap=0.9))
+    assert decide(*pair, starts(turned(0.5)), asked).status == "ok"
+    strict = Register(verdict=Verdict(least_overlap=1.0))
+    found = decide(*pair, starts(turned(0.5)), strict)
+    assert found.status == "failed"
+    assert "at least 100% expected" in found.reason
+    assert "least_overlap" in found.reason

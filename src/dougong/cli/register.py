@@ -29,6 +29,7 @@ def command(
     pairs: Path | None = None,
     control: Path | None = None,
     grid_scale: str = "auto",
+    least_overlap: float | None = None,
     source_crs: str | None = None,
     target_crs: str | None = None,
     accept_best: Annotated[bool, Parameter(negative="", show_default=False)] = False,
@@ -75,6 +76,9 @@ def command(
     grid_scale
         Combined factor (grid / ground) of a cloud in a map projection; auto: from its system and
         height; off: the map is true to scale, as site-calibrated ground systems are; or a number.
+    least_overlap
+        Refuse a pose under which neither cloud has this share of itself within reach of the
+        other; 0.2 where it is not given.
     source_crs
         Coordinate system of a SOURCE that names none, such as EPSG:32650.
     target_crs
@@ -98,6 +102,7 @@ def command(
                 "yaw_hint_deg": yaw_hint,
                 "grid_scale": grid_scale,
                 "accept_best": accept_best,
+                **({} if least_overlap is None else {"verdict": {"least_overlap": least_overlap}}),
             },
             crs=(source_crs, target_crs),
             source_kind=source_kind,

@@ -12,7 +12,7 @@ from dougong.registration import hypotheses as ranking
 from dougong.registration.control import Adjusted, Control, adjust, weigh_control
 from dougong.registration.covariance import displacement95
 from dougong.registration.evidence import Court, hear, summon
-from dougong.registration.handedness import LEFT_SENTENCE, handedness
+from dougong.registration.handedness import LEFT_SENTENCE, OPEN_SENTENCE, handedness
 from dougong.registration.icp import Icp, build_levels, refine
 from dougong.registration.laps import Laps
 from dougong.registration.overlap import apply
@@ -90,11 +90,13 @@ def decide(
         status, reason = weigh_height(reason, left_open)
         if status != "ok":
             # The other side of the roof is one more pose that fits as well.
-            evidence = replace(evidence, rivals=(*evidence.rivals, 1.0), is_undecided=True)
+            evidence = _with_one_more(evidence)
     if status == "ok":
         hand = handedness(court, levels, ruling.winner, quick, params.verdict)
         if hand == "left":
             return refused(LEFT_SENTENCE)
+        if hand == "open":
+            status, reason, evidence = "ambiguous", OPEN_SENTENCE, _with_one_more(evidence)
         reason += " Its mirror image fits as well." if hand == "unknown" else ""
         clock.lap("mirror check")
     status, reason = weigh_control(status, reason, adjusted)
@@ -122,6 +124,11 @@ def _evidence(ruling: Ruling, spread_m: float) -> Evidence:
         rivals=tuple(c.chance for c in (*ruling.undecided, *ruling.beaten)),
         is_undecided=bool(ruling.undecided),
     )
+
+
+def _with_one_more(evidence: Evidence) -> Evidence:
+    """Return the evidence with one more rival that fits as well as the winner."""
+    return replace(evidence, rivals=(*evidence.rivals, 1.0), is_undecided=True)
 
 
 def _probability(status: str, ruling: Ruling, evidence: Evidence) -> float:

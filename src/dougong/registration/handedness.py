@@ -17,9 +17,9 @@ from dougong.registration.evidence import Court, Testimony, Witness, hear
 from dougong.registration.icp import Icp, Level, refined_pose
 from dougong.registration.overlap import Rung
 from dougong.registration.rivals import propose_mirrored
-from dougong.registration.verdict import Verdict, compare, is_beaten
+from dougong.registration.verdict import Comparison, Verdict, compare, is_beaten
 
-Handedness = Literal["right", "left", "unknown"]
+Handedness = Literal["right", "left", "open", "unknown"]
 
 _FLIP = np.array([-1.0, 1.0, 1.0])
 _TRIED = 3
@@ -30,6 +30,12 @@ LEFT_SENTENCE = (
     "left-handed. Export it again with x and y in the right order and sign (negate x, or swap "
     "x and y)."
 )
+OPEN_SENTENCE = (
+    "the mirror image of the source lays more of it on the target, and what both images share "
+    "contradicts neither: the clouds may show two parts of a building that mirror each other, or "
+    "one file is left-handed (inscriptions then read backwards). Control points or more overlap "
+    "would decide."
+)
 
 
 def handedness(
@@ -37,7 +43,9 @@ def handedness(
 ) -> Handedness:
     """Say whether the source's mirror image fits clearly worse ("right") or better ("left").
 
-    "unknown": the blocks cannot tell, as when all that both clouds show equals its mirror image.
+    "open": it fits better, but only by sharing more, and unseen is not empty: one wing of a
+    compound can be laid, mirrored, on the other. "unknown": the blocks cannot tell, as when all
+    that both clouds show equals its mirror image.
     """
     poses = propose_mirrored(court, winner, _TRIED)
     if not poses:
@@ -52,10 +60,18 @@ def handedness(
     best = min(heard, key=lambda testimony: testimony.total)
     if is_beaten(compare(court, winner, best, params.block_m), params):
         return "right"
-    lead = compare(other, best, winner, params.block_m)
-    # Suspicion is enough: a pose taken for right is the worse mistake.
-    is_left = lead.gain >= params.gain and lead.p_value <= _SUSPICION
-    return "left" if is_left else "unknown"
+    if not _leads(compare(other, best, winner, params.block_m), params):
+        return "unknown"
+    shared = compare(other, best, winner, params.block_m, best.is_within & winner.is_within)
+    return "left" if _leads(shared, params) else "open"
+
+
+def _leads(mirror: Comparison, params: Verdict) -> bool:
+    """Say whether the mirror image is believed to fit better.
+
+    Suspicion is enough: a pose taken for right is the worse mistake.
+    """
+    return mirror.gain >= params.gain and mirror.p_value <= _SUSPICION
 
 
 def _mirrored_witness(witness: Witness) -> Witness:
@@ -72,6 +88,7 @@ def _mirrored_witness(witness: Witness) -> Witness:
             plan,
             low=np.array([-high, plan.low[1]]),
             covered=plan.covered[::-1],
+            within=plan.within[::-1],
             top=plan.top[::-1],
         ),
     )

@@ -278,15 +278,16 @@ def _told_apart(court: Court, poses: Sequence[Testimony]) -> tuple[Testimony, li
 def is_beaten(comparison: Comparison, params: Verdict, is_close: bool = False) -> bool:
     """Say whether the data tell a rival from the winner.
 
-    A difference three times as large as asked may be ten times less rare: small sites have few
-    blocks, and a handful of walls cannot be rarer than that. Within about a metre (`is_close`)
-    what is bent or unseen is alike for both: a small gain is a true one, and a large one needs no
-    count of blocks.
+    The larger the difference, the less rare it has to be, up to ten times at three times the gain
+    asked for: small sites have few blocks, and a handful of walls cannot be rarer. Within about a
+    metre (`is_close`) what is bent or unseen is alike for both: a small gain is a true one, and a
+    large one needs no count of blocks.
     """
     if is_close:
         is_rare = comparison.gain >= params.twin_gain and comparison.p_value <= params.p_value
         return is_rare or comparison.gain >= params.gain
-    limit = params.p_value * (10.0 if comparison.gain >= 3.0 * params.gain else 1.0)
+    surplus = min(max((comparison.gain / params.gain - 1.0) / 2.0, 0.0), 1.0)
+    limit = params.p_value * 10.0**surplus
     return comparison.gain >= params.gain and comparison.p_value <= limit
 
 
@@ -348,7 +349,8 @@ def status_of(ruling: Ruling, fine: FineResult | None, params: Verdict) -> tuple
     if overlap < params.least_overlap:
         return "failed", (
             f"only {overlap:.0%} of either cloud has the other within reach (at least "
-            f"{params.least_overlap:.0%} expected). Scan more of what both show."
+            f"{params.least_overlap:.0%} expected). Scan more of what both show; where they are "
+            "known to share so little, allow less (least_overlap) and check the result."
         )
     if ruling.violation > params.most_violation:
         return "failed", (
