@@ -16,9 +16,9 @@ from dougong.tiles.cloud import load_tiles, read_arrays
 from dougong.tiles.engine import Task, local_engine
 from dougong.tiles.folder import LocalFolder
 from dougong.tiles.partition import partition
+from dougong.tiles.parts import Job
 from dougong.tiles.spool import Spool
 from dougong.tiles.stages import TileBench
-from dougong.tiles.work import Job
 
 JOBS = [
     ("low_outliers", {}),

@@ -16,12 +16,14 @@ from dougong._checks import as_points
 from dougong.errors import InputError
 from dougong.kernels import boxtree, moments, neighbours, order, self_neighbours
 from dougong.threads import for_blocks
-from dougong.typing import Index, Points, Values
+from dougong.typing import Index, Mask, Points, Values
 
 _SUBTREES = 32
 """Parts of the tree that are built apart, on the threads."""
 _BLOCK = 32_768
 """Queries per task: fixed, so results do not depend on the thread count."""
+_FEW_LEAVES = 16
+"""So many leaves are passed over or looked at together where only some points are wanted."""
 _SEARCHES = 4096
 """The same for `nearest`, which a fit asks many times for few points: enough work for a task."""
 
@@ -240,6 +242,32 @@ def blocks_of_leaves(index: Neighbourhood) -> tuple[int, int]:
     return len(index.boxes) // 2, _BLOCK // boxtree.LEAF
 
 
+def leaves_of(index: Neighbourhood, is_wanted: Mask) -> list[tuple[int, int]]:
+    """Return (first leaf, last leaf + 1) of blocks that hold all wanted points (n,), few others.
+
+    In sorted order. For passes over a part of an index, such as a tile's own points.
+    """
+    leaves, n = len(index.boxes) // 2, len(index.points)
+    if not is_wanted.any():
+        return []
+    first = np.arange(0, leaves, _FEW_LEAVES)
+    is_needed = np.logical_or.reduceat(is_wanted, first * n // leaves)
+    blocks: list[tuple[int, int]] = []
+    for start in first[is_needed].tolist():
+        stop = min(start + _FEW_LEAVES, leaves)
+        if blocks and blocks[-1][1] == start and stop - blocks[-1][0] <= _BLOCK // boxtree.LEAF:
+            blocks[-1] = (blocks[-1][0], stop)
+        else:
+            blocks.append((start, stop))
+    return blocks
+
+
+def points_of(index: Neighbourhood, leaves: tuple[int, int]) -> tuple[int, int]:
+    """Return (first, last + 1) of the points, in sorted order, in a block of leaves."""
+    n, count = len(index.points), len(index.boxes) // 2
+    return leaves[0] * n // count, leaves[1] * n // count
+
+
 def self_knn_block(
     index: Neighbourhood, k: int, limit2: float, first_leaf: int, last_leaf: int
 ) -> tuple[int, Index, Values]:
@@ -247,9 +275,7 @@ def self_knn_block(
 
     Everything in sorted order: for passes that reduce neighbours at once, never holding n k.
     """
-    n = len(index.points)
-    leaves = len(index.boxes) // 2
-    start, stop = first_leaf * n // leaves, last_leaf * n // leaves
+    start, stop = points_of(index, (first_leaf, last_leaf))
     places = np.empty((stop - start, k), np.int64)
     distance2 = np.empty((stop - start, k))
     self_neighbours.self_knn(

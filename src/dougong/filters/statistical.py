@@ -4,7 +4,7 @@ METHOD.md 1.4 (Rusu et al. 2008). Kernels are imported when called.
 """
 
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,9 @@ from dougong.filters.totals import LARGEST, Totals
 from dougong.params import Parameters
 from dougong.threads import for_blocks
 from dougong.typing import Index, Points, Values
+
+if TYPE_CHECKING:
+    from dougong.filters.neighbourhood import Neighbourhood
 
 KIND: Literal["local", "two-pass", "global"] = "two-pass"
 
@@ -80,24 +83,30 @@ def mean_distances(points: ArrayLike, params: Statistical) -> Values:
 
 
 def _mean_of_nearest(xyz: Points, k: int) -> Values:
-    return nearest_distances(xyz, k)[0]
+    from dougong.filters.neighbourhood import build_index
+
+    return nearest_distances(build_index(xyz), k, len(xyz))[0]
 
 
-def nearest_distances(xyz: Points, k: int) -> tuple[Values, Values]:
-    """Return mean and largest (n,) of the distances to the k nearest others; inf with fewer."""
-    from dougong.filters.neighbourhood import blocks_of_leaves, build_index, self_knn_block
+def nearest_distances(index: "Neighbourhood", k: int, own: int) -> tuple[Values, Values]:
+    """Return mean and largest (own,) of the distances to the k nearest others; inf with fewer.
 
-    index = build_index(xyz)
-    mean, largest = np.full(len(xyz), np.inf), np.full(len(xyz), np.inf)
+    Of the first `own` points in the caller's order.
+    """
+    from dougong.filters.neighbourhood import leaves_of, self_knn_block
 
-    def task(first: int, last: int) -> None:
-        start, _, distance2 = self_knn_block(index, k, np.inf, first, last)
-        rows = index.order[start : start + len(distance2)]
-        mean[rows], largest[rows] = mean_and_largest(np.sqrt(distance2))
+    n = len(index.points)
+    mean, largest = np.full(n, np.inf), np.full(n, np.inf)
+    blocks = leaves_of(index, index.order < own) if n > 1 else []
 
-    if len(xyz) > 1:
-        for_blocks(*blocks_of_leaves(index), task)
-    return mean, largest
+    def task(start: int, stop: int) -> None:
+        for block in blocks[start:stop]:
+            first, _, distance2 = self_knn_block(index, k, np.inf, *block)
+            rows = index.order[first : first + len(distance2)]
+            mean[rows], largest[rows] = mean_and_largest(np.sqrt(distance2))
+
+    for_blocks(len(blocks), 1, task)
+    return mean[:own], largest[:own]
 
 
 def mean_and_largest(distance_m: NDArray[np.float64]) -> tuple[Values, Values]:

@@ -32,9 +32,9 @@ from dougong.tiles.cloud import POINTS, TiledCloud, load_tiles, read_arrays
 from dougong.tiles.engine import engine_in_use
 from dougong.tiles.folder import Folder
 from dougong.tiles.partition import partition
+from dougong.tiles.parts import state_of
 from dougong.tiles.spool import Spool
 from dougong.tiles.stages import TileBench
-from dougong.tiles.work import state_of
 
 CHUNK_POINTS = 1_000_000
 _LEAST_BYTES_PER_POINT = 4

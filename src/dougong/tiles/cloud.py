@@ -92,15 +92,20 @@ def name_of(tile: Tile, stage: str) -> str:
     return f"{tile.name}.{stage}.npz"
 
 
-def read_arrays(folder: Folder, tile: Tile, stage: str, *names: str) -> Arrays:
+def read_arrays(
+    folder: Folder, tile: Tile, stage: str, *names: str, if_there: bool = False
+) -> Arrays:
     """Return the arrays `names` of a stage, or all of them."""
-    return read_file(folder, name_of(tile, stage), *names)
+    return read_file(folder, name_of(tile, stage), *names, if_there=if_there)
 
 
-def read_file(folder: Folder, file_name: str, *names: str) -> Arrays:
-    """Return the arrays `names` of a file, or all of them."""
+def read_file(folder: Folder, file_name: str, *names: str, if_there: bool = False) -> Arrays:
+    """Return the arrays `names` of a file, or all of them; `if_there`: those that it has."""
     with folder.open(file_name) as file, np.load(file) as stored:
-        return {name: stored[name] for name in names or stored.files if name != _RECORD}
+        wanted = names or stored.files
+        if if_there:
+            wanted = [name for name in wanted if name in stored.files]
+        return {name: stored[name] for name in wanted if name != _RECORD}
 
 
 def read_record(folder: Folder, file_name: str) -> Record | None:

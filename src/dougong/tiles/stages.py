@@ -29,10 +29,11 @@ from dougong.filters.statistical import Statistical, cut_distance, stray_notes
 from dougong.filters.totals import Totals
 from dougong.filters.wires import are_rows
 from dougong.params import Parameters
-from dougong.tiles import work
+from dougong.tiles import nearest, work
 from dougong.tiles.cloud import (
     Arrays,
     Record,
+    Tile,
     TiledCloud,
     name_of,
     read_arrays,
@@ -40,7 +41,8 @@ from dougong.tiles.cloud import (
     write_arrays,
 )
 from dougong.tiles.engine import Engine, Task
-from dougong.tiles.work import Among, Job, asked_points, is_asked, state_of
+from dougong.tiles.parts import Among, Job, asked_of, asked_points, is_asked, state_of
+from dougong.typing import Mask
 
 Work = Callable[[Job], tuple[Arrays, Record]]
 
@@ -80,7 +82,7 @@ class TileBench:
         """
         start = time.perf_counter()
         asked = sum(
-            int(is_asked(state_of(self.cloud.folder, tile, self.state), among).sum())
+            int(asked_of(self.cloud.folder, tile, self.state, among).sum())
             for tile in self.cloud.tiles
         )
         stage = _Stage(self.cloud, self.engine, self.state, params, among, asked)
@@ -133,10 +135,9 @@ class _Stage:
         ]
         return self.engine.run(tasks), key
 
-    def mask_and_state(self, tile: Any) -> tuple[Any, Arrays]:
-        """Return which points of a tile are asked about, and their state."""
-        state = state_of(self.cloud.folder, tile, self.before)
-        return is_asked(state, self.among), state
+    def mask(self, tile: Tile) -> Mask:
+        """Return which points of a tile are asked about."""
+        return asked_of(self.cloud.folder, tile, self.before, self.among)
 
     def blocks(self) -> Any:
         """Yield the points that the stage is asked about, tile by tile."""
@@ -225,7 +226,7 @@ def _statistical(stage: _Stage) -> Outcome:
     if stage.params.radius_m is not None:
         _, means = stage.map("mean_within", work.mean_within)
     else:
-        _, means = stage.map("nearest", work.nearest, stage.params.neighbours)
+        _, means = stage.map("nearest", nearest.nearest, stage.params.neighbours)
     cut, strays = cut_distance(stage.values(means, "mean"), stage.params.multiplier)
     records, key = stage.map("statistical", work.judge_statistical, (means, cut))
     return records, stray_notes(strays), key
@@ -242,8 +243,8 @@ def _pass_through(stage: _Stage) -> Outcome:
 
 def _heights(stage: _Stage) -> Any:
     for tile in stage.cloud.tiles:
-        mask, state = stage.mask_and_state(tile)
-        yield state["height"][mask] if "height" in state else np.empty(0)
+        state = state_of(stage.cloud.folder, tile, stage.before)
+        yield state["height"][is_asked(state, stage.among)] if "height" in state else np.empty(0)
 
 
 def _curvature_weighted(stage: _Stage) -> Outcome:
@@ -263,7 +264,7 @@ def _protective(stage: _Stage, params: CurvatureWeighted) -> Outcome:
     asked = stage.asked
     reach = params.reach_m
     if reach is None:
-        _, found = stage.map("eighth", work.nearest, protective.TESTS)
+        _, found = stage.map("eighth", nearest.nearest, protective.TESTS)
         reach = protective.reach_of(stage.values(found, "largest"), asked)
     is_whole = params.reach_m is None
     whole = protective.Whole(reach, is_few=is_whole and asked <= protective.TESTS)
@@ -285,7 +286,7 @@ def _concentration(stage: _Stage, key: str) -> str | None:
     for tile, points in zip(stage.cloud.tiles, stage.blocks(), strict=True):
         if not len(points):
             continue
-        mask, _ = stage.mask_and_state(tile)
+        mask = stage.mask(tile)
         after = read_arrays(stage.cloud.folder, tile, key, "code", "curvature")
         is_kept = after["code"][mask] == Reason.KEPT
         part = tally(points, is_kept, after["curvature"], spacing_m)
