@@ -12,7 +12,7 @@ import numpy as np
 
 from dougong.filters.neighbourhood import Neighbourhood, blocks_of_leaves, self_knn_block
 from dougong.threads import for_blocks
-from dougong.typing import Index, Mask, Values
+from dougong.typing import Index, Mask, Points, Values
 
 NEIGHBOURS = 8
 """The distance to this many nearest others says how densely a place is sampled."""
@@ -71,16 +71,16 @@ def clusters_of(index: Neighbourhood, gap: Values, least_m: float) -> Clusters:
     return Clusters(parent, held, longest)
 
 
-def distance_to(index: Neighbourhood, chosen: Mask, asked: Index, limit_m: float) -> Values:
-    """Return the distance (m,) from the `asked` points to the nearest `chosen` (n,) one.
+def distance_to(index: Neighbourhood, chosen: Mask, queries: Points, limit_m: float) -> Values:
+    """Return the distance (m,) from `queries` (m, 3) to the nearest `chosen` (n,) point.
 
-    At most `limit_m`, which stands for anything farther. Everything in sorted order.
+    At most `limit_m`, which stands for anything farther. chosen is in sorted order.
     """
     from dougong.kernels import protective as kernels
 
     nodes = np.zeros(len(index.boxes), bool)
     kernels.flag_nodes(chosen, nodes)
-    gap2 = np.empty(len(asked))
+    gap2 = np.empty(len(queries))
 
     def task(start: int, stop: int) -> None:
         kernels.gaps(
@@ -89,11 +89,11 @@ def distance_to(index: Neighbourhood, chosen: Mask, asked: Index, limit_m: float
             chosen,
             nodes,
             limit_m**2,
-            asked[start:stop],
+            queries[start:stop],
             gap2[start:stop],
         )
 
-    for_blocks(len(asked), _BLOCK, task)
+    for_blocks(len(queries), _BLOCK, task)
     return np.sqrt(gap2)
 
 

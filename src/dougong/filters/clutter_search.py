@@ -201,4 +201,6 @@ def _stands_clear(site: _Site, members_of: Index, clear_m: float) -> bool:
     own = site.clusters.root[members_of[0]]
     is_large = site.clusters.longest_m[site.clusters.root] > STRUCTURE_M
     chosen = is_large & (site.clusters.root != own)
-    return bool(distance_to(site.index, chosen, members_of, clear_m).min() >= clear_m)
+    return bool(
+        distance_to(site.index, chosen, site.index.points[members_of], clear_m).min() >= clear_m
+    )

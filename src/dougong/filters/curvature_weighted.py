@@ -7,7 +7,7 @@ import math
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from dougong._checks import as_points
@@ -15,8 +15,8 @@ from dougong.errors import InputError
 from dougong.filters import protective
 from dougong.filters.balls import BLUR, Balls, CellBalls, ExactBalls, Lattice, build_lattice
 from dougong.filters.concentration import concentration_note
-from dougong.filters.groups import Groups
 from dougong.filters.selection import Selection
+from dougong.filters.surroundings import Tests
 from dougong.filters.totals import Totals
 from dougong.params import Parameters
 from dougong.threads import for_blocks
@@ -43,8 +43,8 @@ class CurvatureWeighted(Parameters):
     """``protective``: share of the points of a randomly sampled surface that each of its distance
     tests would take if nothing excused them. More removes more."""
     reach_m: Annotated[float, Field(gt=0)] | None = None
-    """``protective``: nothing farther is a neighbour; the halo is 17 times this. None: 0.5 m,
-    doubled or halved until it is 5 to 100 median spacings of the cloud."""
+    """``protective``: nothing farther is a neighbour; tiles read 5 times this beyond their borders.
+    None: 0.5 m, doubled or halved until it is 5 to 100 median spacings of the cloud."""
     radius_init_m: Annotated[float, Field(gt=0)] = 0.3
     """Radius of the ball that curvature and local statistics are taken from."""
     radius_min_m: Annotated[float, Field(gt=0)] = 0.05
@@ -83,6 +83,11 @@ class CurvatureWeighted(Parameters):
                 msg = f"{name} must not exceed {name.replace('min', 'max')}, got {low} > {high}."
                 raise ValueError(msg)
         return self
+
+    @property
+    def tests(self) -> Tests:
+        """What rule ``protective`` tests by."""
+        return Tests(self.alpha, self.gamma, self.surface_loss)
 
     def weight(self, curvature: Values) -> Values:
         """Return w (n,) of eq. 5, at least 1."""
@@ -197,7 +202,7 @@ def curvature_weighted(
     params: CurvatureWeighted | None = None,
     *,
     voxel_count: ArrayLike | None = None,
-    whole: protective.Whole | Totals | None = None,
+    whole: Totals | None = None,
 ) -> Selection:
     """Choose the points that have a neighbour about as near as their surroundings do.
 
@@ -208,8 +213,8 @@ def curvature_weighted(
     params : CurvatureWeighted
     voxel_count : array_like, shape (n,), optional
         How many points each point stands for after decimation; used by `solid_voxel_count`.
-    whole : Whole or Totals, optional
-        Where the points are a part of a cloud: what ``protective`` and ``global`` know of it.
+    whole : Totals, optional
+        Where the points are a part of a cloud: what ``global`` knows of it.
 
     Returns
     -------
@@ -224,15 +229,13 @@ def curvature_weighted(
     ``paper`` and ``global`` round coordinates to 2**-18 m (for 0.3 m) and sum exact integers, so
     nothing depends on the order of the points. The cost of an exact ball grows with the square root
     of the points in it, that of a fast one does not.
-    Tile class: local, with the halo of `halo_m` (``protective`` with a reach_m: 17 of it;
-    ``paper``: 2 radius_init_m + radius_max_m, fast 0.22 radius_init_m more); ``global`` is
-    two-pass.
+    Tile class: local, with the halo of `halo_m` (``paper``: 2 radius_init_m + radius_max_m, fast
+    0.22 radius_init_m more); ``global`` is two-pass. ``protective`` reaches 17 reach_m far, but
+    tiles read 5 (`surroundings.HALO`): groups are joined across their borders.
     """
     p = params or CurvatureWeighted()
     if p.rule == "protective":
-        assert not isinstance(whole, Totals)
-        return judge_protective(points, p, voxel_count, whole)[0]
-    assert not isinstance(whole, protective.Whole)
+        return _protective(points, p, voxel_count)
     found = _judge(points, p, whole)
     lattice = found.lattice
     n = len(lattice.points)
@@ -250,34 +253,34 @@ def curvature_weighted(
     )
 
 
-def judge_protective(
-    points: ArrayLike,
-    p: CurvatureWeighted,
-    voxel_count: ArrayLike | None,
-    whole: protective.Whole | None,
-) -> tuple[Selection, Groups]:
-    """Return the choice of rule ``protective`` and what groups the points' own ones are in."""
-    verdict = protective.judge(points, p.alpha, p.gamma, p.surface_loss, p.reach_m, whole)
-    is_kept = verdict.reason == protective.Taken.KEPT
-    reason = verdict.reason
+def _protective(
+    points: ArrayLike, p: CurvatureWeighted, voxel_count: ArrayLike | None
+) -> Selection:
+    verdict = protective.judge(points, p.tests, p.reach_m)
+    chosen = protective_choice(verdict.margin, verdict.reason, p, voxel_count)
+    note = None
+    if len(chosen.is_kept):
+        spacing_m = float(np.median(verdict.spacing_m))
+        note = concentration_note(as_points(points), chosen.is_kept, verdict.curvature, spacing_m)
+    more = {"curvature": verdict.curvature, "spacing_m": verdict.spacing_m}
+    return Selection(
+        is_kept=chosen.is_kept,
+        attributes={**chosen.attributes, **more},
+        notes=() if note is None else (note,),
+    )
+
+
+def protective_choice(
+    margin: Values, reason: NDArray[np.uint8], p: CurvatureWeighted, voxel_count: ArrayLike | None
+) -> Selection:
+    """Return the choice of rule ``protective``, solid voxels spared where that is asked."""
+    is_kept = reason == protective.Taken.KEPT
     if p.solid_voxel_count is not None:
         is_kept |= _is_solid(voxel_count, len(is_kept), p.solid_voxel_count)
         reason = np.where(is_kept, protective.Taken.KEPT, reason).astype(np.uint8)
-    note = None
-    if len(is_kept) and whole is None:
-        spacing_m = float(np.median(verdict.spacing_m))
-        note = concentration_note(as_points(points), is_kept, verdict.curvature, spacing_m)
-    selection = Selection(
-        is_kept=is_kept,
-        attributes={
-            "curvature": verdict.curvature,
-            "removal_margin": verdict.margin,
-            "removal_reason": reason,
-            "spacing_m": verdict.spacing_m,
-        },
-        notes=() if note is None else (note,),
+    return Selection(
+        is_kept=is_kept, attributes={"removal_margin": margin, "removal_reason": reason}
     )
-    return selection, verdict.groups
 
 
 def _is_solid(voxel_count: ArrayLike | None, n: int, at_least: int) -> Mask:

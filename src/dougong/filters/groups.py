@@ -1,21 +1,20 @@
-"""Groups of points that hold together, and how far the small ones hover from everything large.
+"""Groups of points that hold together: which are large, and which are pieces of one thing.
 
 The part of the protective rule that judges things, not points: a bird, a leaf or a passer-by's
-fringe is a group that is smaller than its distance from everything large. Kernels are imported
-when called.
+fringe is a group that is smaller than its distance from everything large. Groups are known by
+number, and what is known of them adds up: those of two parts of a cloud that are one group become
+one without their points. Kernels are imported when called.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dougong.filters.local_spacing import SMALLEST_M, STEPS
-from dougong.typing import Index, Mask, Values
-
-if TYPE_CHECKING:
-    from dougong.filters.neighbourhood import Neighbourhood
+from dougong.typing import Index, Mask, Points, Values
 
 LINK = 2.0
 """Points within this many spacings make a group: an even surface holds together from 1.2 on."""
@@ -33,122 +32,110 @@ BETWEEN = 0.5
 links of a chain, a bell below its bracket, a relief that the scanner saw in patches."""
 
 
-class Groups(NamedTuple):
-    """What was found of the groups that own points belong to."""
+class Sizes(NamedTuple):
+    """What is known of g groups."""
 
-    has_large: bool
-    most: int
-    """Points of the one with most points."""
-
-
-class _Sizes(NamedTuple):
-    """The groups of all points, in sorted order; at a group's root, and 0 elsewhere."""
-
-    parent: Index
-    """(n,) the root of each point's group."""
     held: Index
-    """(n,) points."""
+    """(g,) points."""
+    steps: Index
+    """(g,) the sum of their spacings, in whole steps: the order of adding changes nothing."""
     flat: Index
-    """(n,) of them, those on a surface or a line."""
-    longest: Values
-    """(n,) longest side of the box, metres."""
-    size: Values
-    """(n,) that, or the side of the square that the points would cover at the spacing here, if
-    that is longer."""
+    """(g,) of the points, those on a surface or a line."""
+    boxes: NDArray[np.float64]
+    """(g, 6) low and high corner, metres."""
 
-    def are_large(self, limit_m: float, many: int) -> Mask:
-        """Say which roots (n,) are those of large groups."""
+    @property
+    def longest_m(self) -> Values:
+        """(g,) the longest side of the box."""
+        longest: Values = (self.boxes[:, 3:] - self.boxes[:, :3]).max(axis=1, initial=0.0)
+        return longest
+
+    @property
+    def size_m(self) -> Values:
+        """(g,) the longest side, or the side of the square that the points would cover.
+
+        At the spacing that is usual there, if that square's is longer.
+        """
+        usual = self.steps / self.held * (SMALLEST_M / STEPS)
+        size: Values = np.maximum(usual * np.sqrt(self.held), self.longest_m)
+        return size
+
+    def are_large(self, reach_m: float) -> Mask:
+        """Say which groups (g,) are large."""
         # One place held many times over shows no surface.
-        is_solid = (self.flat >= SOLID) & (self.longest > 0.0)
-        return (self.longest > limit_m) | (self.held >= many) | is_solid
+        longest = self.longest_m
+        is_solid = (self.flat >= SOLID) & (longest > 0.0)
+        return (longest > GROUP * reach_m) | (self.held >= MANY) | is_solid
+
+    def merged(self, into: Index) -> Sizes:
+        """Return the groups after each became a part of the one that `into` (g,) names."""
+        count = int(into.max(initial=-1)) + 1
+        held, steps, flat = np.zeros((3, count), np.int64)
+        boxes = np.full((count, 6), np.inf)
+        boxes[:, 3:] = -np.inf
+        for values, total in ((self.held, held), (self.steps, steps), (self.flat, flat)):
+            np.add.at(total, into, values)
+        np.minimum.at(boxes[:, :3], into, self.boxes[:, :3])
+        np.maximum.at(boxes[:, 3:], into, self.boxes[:, 3:])
+        return Sizes(held, steps, flat, boxes)
 
 
-def group_margin(
-    index: Neighbourhood,
-    parent: Index,
-    spacing: Values,
-    variation: Values,
-    *,
-    limit_m: float,
-    many: int,
-    own: int,
-    is_whole: bool,
-) -> tuple[Values, Groups]:
-    """Return gap / size (n,) of each point's group, 0 in a large one, and what groups there are.
+def sizes_of(points: Points, spacing_m: Values, variation: Values, group: Index) -> Sizes:
+    """Return what is to be known of the groups 0, 1, 2 ... that points (n, 3) are in.
 
     Parameters
     ----------
-    index : Neighbourhood
-        Everything is in its sorted order.
-    parent : ndarray, shape (n,)
-        The root of each point's group of linked points.
-    spacing : ndarray, shape (n,)
-        Metres.
+    points : ndarray, shape (n, 3)
+    spacing_m : ndarray, shape (n,)
+        What is usual round each point.
     variation : ndarray, shape (n,)
         Surface variation of each point's neighbourhood.
-    limit_m, many
-        A group that is longer, or has so many points, is large; no wider gap is looked across.
-    own : int
-        The first so many of the caller's points are its own, the others its halo.
-    is_whole : bool
-        The points are a whole cloud. Where no group is large, the one of most points then is: a
-        small thing alone is what was scanned.
+    group : ndarray, shape (n,)
+        The number of its group; every number is one's.
     """
-    from dougong.filters.clusters import distance_to
-
-    is_flat = variation < FLAT
-    sizes = _sizes_of(index, parent, spacing, is_flat)
-    sizes = _with_pieces_joined(index, sizes, spacing, is_flat, sizes.are_large(limit_m, many))
-    is_large = sizes.are_large(limit_m, many)
-    mine = sizes.parent[index.order < own]
-    groups = Groups(bool(is_large[mine].any()), int(sizes.held[mine].max(initial=0)))
-    if is_whole and len(parent) and not is_large.any():
-        is_large = sizes.held == sizes.held.max()
-    chosen = is_large[sizes.parent]
-    asked = np.flatnonzero(~chosen)
-    margin = np.zeros(len(parent))
-    if len(asked):
-        root = sizes.parent[asked]
-        gap = np.full(len(parent), np.inf)
-        np.minimum.at(gap, root, distance_to(index, chosen, asked, limit_m))
-        margin[asked] = gap[root] / sizes.size[root]
-    return margin, groups
-
-
-def _sizes_of(index: Neighbourhood, parent: Index, spacing: Values, is_flat: Mask) -> _Sizes:
     from dougong.kernels import protective as kernels
 
-    n = len(parent)
-    held, sums = np.zeros(n, np.int64), np.zeros(n, np.int64)
-    boxes = np.empty((n, 6))
-    steps = np.rint(spacing / SMALLEST_M * STEPS).astype(np.int64)
-    kernels.measure(index.points, steps, parent, held, sums, boxes)
-    is_root = held > 0
-    longest, size = np.zeros(n), np.zeros(n)
-    longest[is_root] = (boxes[is_root, 3:] - boxes[is_root, :3]).max(axis=1)
-    usual = sums[is_root] / held[is_root] * (SMALLEST_M / STEPS)
-    size[is_root] = np.maximum(usual * np.sqrt(held[is_root]), longest[is_root])
-    flat = np.bincount(parent[is_flat], minlength=n)
-    return _Sizes(parent, held, flat, longest, size)
+    count = int(group.max(initial=-1)) + 1
+    held, sums = np.zeros((2, count), np.int64)
+    boxes = np.empty((count, 6))
+    steps = np.rint(spacing_m / SMALLEST_M * STEPS).astype(np.int64)
+    kernels.measure(points, steps, group, held, sums, boxes)
+    flat = np.bincount(group[variation < FLAT], minlength=count)
+    return Sizes(held, sums, flat, boxes)
 
 
-def _with_pieces_joined(
-    index: Neighbourhood, sizes: _Sizes, spacing: Values, is_flat: Mask, is_large: Mask
-) -> _Sizes:
-    """Return the groups after those small ones that are pieces of one thing became one."""
+def joined(count: int, one: Index, other: Index) -> Index:
+    """Return what each of `count` groups becomes a part of, numbered 0, 1, 2 ...
+
+    Those of each pair `one` (m,), `other` (m,) become one, and so do chains of pairs.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    if not len(one):
+        return np.arange(count)
+    pairs = coo_array((np.ones(len(one), np.bool_), (one, other)), shape=(count, count))
+    into: Index = connected_components(pairs, directed=False)[1].astype(np.int64)
+    return into
+
+
+def pieces_joined(points: Points, group: Index, sizes: Sizes, is_large: Mask) -> Index:
+    """Return what each group becomes a part of (g,) when pieces of one thing become one.
+
+    points (m, 3) and their group (m,) hold those of all groups that are not large, at least.
+    """
     from dougong.filters.neighbourhood import build_index
     from dougong.kernels import clusters as kernels
 
+    count = len(sizes.held)
     is_piece = (sizes.held > PIECE) & ~is_large
-    chosen = np.flatnonzero(is_piece[sizes.parent])
     if np.count_nonzero(is_piece) < 2:
-        return sizes
-    tree = build_index(index.points[chosen])
-    at = chosen[tree.order]
-    gap = BETWEEN * sizes.size[sizes.parent[at]]
-    _, first, group = np.unique(sizes.parent[at], return_index=True, return_inverse=True)
-    joined = first[group]
-    kernels.link_within(tree.points, tree.boxes, gap, float(gap.min()), joined)
-    parent = sizes.parent.copy()
-    parent[at] = at[joined]
-    return _sizes_of(index, parent, spacing, is_flat)
+        return np.arange(count)
+    chosen = np.flatnonzero(is_piece[group])
+    tree = build_index(points[chosen])
+    mine = group[chosen[tree.order]]
+    gap = BETWEEN * sizes.size_m[mine]
+    _, first, number = np.unique(mine, return_index=True, return_inverse=True)
+    together = first[number]
+    kernels.link_within(tree.points, tree.boxes, gap, float(gap.min()), together)
+    return joined(count, mine, mine[together])

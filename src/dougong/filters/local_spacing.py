@@ -22,32 +22,33 @@ SMALLEST_M = 2.0**-14
 _BLOCK = 1 << 13
 
 
-def local_spacing(points: Points, own_m: Values, reach_m: float) -> Values:
-    """Return the spacing (n,) usual round every point: the geometric mean over its surroundings.
+def local_spacing(points: Points, own_m: Values, reach_m: float, first: int) -> Values:
+    """Return the spacing usual round the `first` of the points: the mean over their surroundings.
+
+    points (n, 3) and the spacing that each shows itself, own_m (n,); returns (first,), metres.
 
     A geometric mean by points: noise is few and hardly counts. Where few points are near, the
     wider surroundings count more, so a flock of birds is not measured by itself.
     """
     steps = np.rint(np.log2(np.maximum(own_m, SMALLEST_M) / SMALLEST_M) * STEPS)
-    near, mean_near = _smooth(points, steps.astype(np.int64), NEAR_CELLS * reach_m)
-    _, mean_far = _smooth(points, steps.astype(np.int64), FAR_CELLS * reach_m)
+    near, mean_near = _smooth(points, steps.astype(np.int64), NEAR_CELLS * reach_m, first)
+    _, mean_far = _smooth(points, steps.astype(np.int64), FAR_CELLS * reach_m, first)
     mean = (near * mean_near + FEW * mean_far) / (near + FEW)
     spacing: Values = SMALLEST_M * np.exp2(mean / STEPS)
     return spacing
 
 
-def _smooth(points: Points, steps: Index, edge: float) -> tuple[Values, Values]:
-    """Return smoothed count and mean (n,) of `steps` (n,) over cells of `edge` metres."""
+def _smooth(points: Points, steps: Index, edge: float, first: int) -> tuple[Values, Values]:
+    """Return smoothed count and mean (first,) of `steps` (n,) over cells of `edge` metres."""
     from dougong.kernels import protective as kernels
 
-    n = len(points)
     keys, axes, cell = _cells_of(points, edge)
     around = _around(keys, axes)
     held = np.bincount(cell, minlength=len(keys))
     sums = np.bincount(cell, weights=steps, minlength=len(keys)).astype(np.int64)
-    count, mean = np.empty(n), np.empty(n)
+    count, mean = np.empty(first), np.empty(first)
     for_blocks(
-        n,
+        first,
         _BLOCK,
         lambda start, stop: kernels.smooth_means(
             points, edge, cell, around, held, sums, start, stop, count, mean

@@ -3,77 +3,46 @@
 docs/denoising.md has the reasoning and what it was measured on. In short: the spacing that
 scans have hereabouts is the yardstick; a neighbour's distance is divided along the surface or the
 line it lies on, and counts a little more across a plane; the first to eighth nearest are tested
-together, so that pairs do not vouch for each other; groups that are smaller than their distance
-from everything large go; rows that chance does not make stay.
+together, so that pairs do not vouch for each other (`surroundings`); groups that are smaller than
+their distance from everything large go (`groups`); rows that chance does not make stay.
+
+Only the surroundings are asked of every point. What comes behind them concerns the few that are in
+doubt, so of a cloud in parts it is settled for all of them at once.
 Kernels are imported when called.
 """
 
 from __future__ import annotations
 
 import math
-from enum import IntEnum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dougong.filters.groups import GROUP, LINK, MANY, Groups, group_margin
-from dougong.filters.local_spacing import FAR_CELLS, SMALLEST_M, local_spacing
-from dougong.filters.ranks import ValueBlocks, at_rank
+from dougong._checks import as_points
+from dougong.filters.groups import GROUP, Sizes, pieces_joined, sizes_of
+from dougong.filters.local_spacing import FAR_CELLS
+from dougong.filters.surroundings import (
+    CHARGE,
+    NEIGHBOURS,
+    TESTS,
+    Taken,
+    Tested,
+    Tests,
+    distance_limits,
+    test_cloud,
+)
 from dougong.threads import for_blocks
-from dougong.typing import Values
+from dougong.typing import Index, Mask, Points, Values
 
-if TYPE_CHECKING:
-    from dougong.filters.neighbourhood import Neighbourhood
+__all__ = ["CHARGE", "NEIGHBOURS", "TESTS", "Taken", "distance_limits"]
 
-NEIGHBOURS = 12
-"""Nearest points that a point's surroundings are seen by."""
-TESTS = 8
-"""The first to this many nearest are tested."""
-REACH_M = 0.5
-"""Nothing farther is a neighbour: doubled or halved to suit the cloud's median spacing."""
-SPARSE, DENSE = 5.0, 50.0
-"""Median spacings that the reach must hold, and may hold before it is halved: 0.5 m serves from
-100 to 10,000 points/m2. In a longer reach scattered noise would have a spacing of its own."""
-CHARGE = 0.25
-"""Of what is excused along a plane, so much is charged across it: where all round lies in a plane,
-a spacing off it is no accident of sampling."""
 ROW_NEIGHBOURS, ROW_WIDTH, ROW_ACCIDENTS = 24, 0.5, 1e-3
 """A point stays if, among this many nearest of those that would go, a row (this many spacings to
 either side) has so many that chance would make fewer than this number of such rows there."""
 ROW_REACH = 0.1
 """In rows the spacing counts as at most this many reaches."""
 _BLOCK = 1 << 13
-
-
-class Taken(IntEnum):
-    """Why the protective rule removes a point: attribute ``removal_reason``."""
-
-    KEPT = 0
-    ALONE = 1
-    """Fewer than eight others within reach."""
-    OFF_SURFACE = 2
-    """Its nearest neighbour is too far, for the spacing here and along the surface there."""
-    IN_PAIR = 3
-    """One to seven others are near, the next is too far."""
-    SMALL_GROUP = 4
-    """It belongs to a group that is smaller than its distance from everything large."""
-
-
-_REASONS = np.array([Taken.ALONE, Taken.OFF_SURFACE] + (TESTS - 1) * [Taken.IN_PAIR], np.uint8)
-"""By the number of the nearest that is too far; 0: too few are in reach."""
-
-
-class Whole(NamedTuple):
-    """What the rule must know of a whole cloud to judge a part of it, its halo included."""
-
-    reach_m: float
-    many: int = MANY
-    """Groups of so many points are large (`is_whole` of `group_margin`)."""
-    is_few: bool = False
-    """So few points that they have no surroundings to be judged by."""
-    own: int = 0
-    """The first so many of the points are the part's own, the others its halo."""
 
 
 class Verdict(NamedTuple):
@@ -87,13 +56,37 @@ class Verdict(NamedTuple):
     """(n,) the spacing of the surface hereabouts, the yardstick."""
     curvature: Values
     """(n,) surface variation of the 12 nearest."""
-    groups: Groups
+
+
+class Doubtful(NamedTuple):
+    """Points of a cloud or a part that may go: some test or a group speaks against them."""
+
+    points: Points
+    """(m, 3) metres."""
+    spacing_m: Values
+    margin: Values
+    """(m,) what the tests say."""
+    reason: NDArray[np.uint8]
+    group: Index
+    """(m,) the number of the group that each is in."""
+
+
+class Things(NamedTuple):
+    """The groups of a whole cloud, pieces of one thing joined."""
+
+    into: Index
+    """(g,) the number of the thing that each group is a part of."""
+    are_large: Mask
+    """(t,) of each thing."""
+    size_m: Values
+    """(t,)."""
 
 
 def halo_m(reach_m: float | None) -> float:
     """Return how far the rule reaches: a group, its gap, another, its pieces, their surroundings.
 
     Points in a row with one that would go are judged themselves, so its length comes on top.
+    Who joins groups across the borders of parts reads less (`surroundings.HALO`).
 
     Infinity where the reach is taken from the cloud: find it first, with `reach_for`.
     """
@@ -103,113 +96,104 @@ def halo_m(reach_m: float | None) -> float:
 
 
 def reach_for(points: ArrayLike) -> float:
-    """Return the reach, metres, for a cloud (n, 3): `REACH_M` where it suits."""
+    """Return the reach, metres, for a cloud (n, 3): `surroundings.REACH_M` where it suits."""
     from dougong.filters.neighbourhood import build_index
 
-    return _neighbours(build_index(points), None)[2]
+    return test_cloud(build_index(points), None, Tests(0.0, 0.0, 0.1))[1]
 
 
-def reach_of(eighth_m: ValueBlocks, points: int) -> float:
-    """Return the reach, metres, of a cloud of so many `points`, by their eighth nearest others."""
-    if points <= TESTS:
-        return REACH_M
-    spacing = at_rank(eighth_m, points // 2) * math.sqrt(math.pi / TESTS)
-    reach = REACH_M
-    while reach < SPARSE * spacing:
-        reach *= 2.0
-    while reach > 2.0 * DENSE * max(spacing, SMALLEST_M):
-        reach /= 2.0
-    return reach
-
-
-def distance_limits(surface_loss: float) -> Values:
-    """Return how far, in spacings, the k-th nearest may be (`TESTS`,).
-
-    On a surface sampled at random the k-th nearest lies within r with pi r^2 / spacing^2
-    distributed as Gamma(k): the share `surface_loss` of such points lies beyond each limit.
-    """
-    from scipy.special import gammainccinv
-
-    limits: Values = np.sqrt(gammainccinv(np.arange(1, TESTS + 1), surface_loss) / np.pi)
-    return limits
-
-
-def line_stretch(limits: Values) -> float:
-    """Return what distances along a line are divided by, in pitches of the line per spacing.
-
-    On a line hit at random the k-th nearest lies within x with 2 x / pitch distributed as
-    Gamma(k), where on a surface it is pi r^2 / spacing^2: this turns the limit of the last test on
-    a surface into that on a line.
-    """
-    return float(0.5 * np.pi * limits[-1])
-
-
-def judge(
-    points: ArrayLike,
-    alpha: float,
-    gamma: float,
-    surface_loss: float,
-    reach_m: float | None = None,
-    whole: Whole | None = None,
-) -> Verdict:
-    """Judge `points` (n, 3), metres; parameters as in `CurvatureWeighted`.
-
-    Where they are a part of a cloud, `whole` says what it must know of it.
-    """
+def judge(points: ArrayLike, tests: Tests, reach_m: float | None = None) -> Verdict:
+    """Judge the points (n, 3) of a whole cloud, metres."""
+    from dougong.filters.clusters import distance_to
     from dougong.filters.neighbourhood import build_index
-    from dougong.kernels import protective as kernels
 
     index = build_index(points)
-    n = len(index.points)
-    is_whole = reach_m is None and whole is None
-    places, own, reach = _neighbours(index, reach_m if whole is None else whole.reach_m)
-    if whole is None:
-        whole = Whole(reach, is_few=is_whole and n <= TESTS, own=n)
-    spacing = local_spacing(index.points, own, reach)
-    curvature, frame = np.zeros(n), np.zeros((n, 9), np.float32)
-    margin, decisive = np.empty(n), np.zeros(n, np.uint8)
-    limits = distance_limits(surface_loss)
-    stretch = line_stretch(limits)
-
-    def see(start: int, stop: int) -> None:
-        kernels.frames(
-            index.points, places, alpha, gamma, spacing, stretch, start, stop, curvature, frame
-        )
-
-    def test(start: int, stop: int) -> None:
-        kernels.support(
-            index.points, places, frame, spacing, limits, reach, CHARGE, start, stop,
-            margin, decisive,
-        )  # fmt: skip
-
-    for_blocks(n, _BLOCK, see)
-    for_blocks(n, _BLOCK, test)
-    reason = _REASONS[decisive]
-    parent = np.arange(n)
-    kernels.link(index.points, places, frame, spacing, LINK, parent)
-    lonely, groups = group_margin(
-        index,
-        parent,
-        spacing,
-        curvature,
-        limit_m=GROUP * whole.reach_m,
-        many=whole.many,
-        own=whole.own,
-        is_whole=is_whole,
-    )
-    is_worse = lonely > margin
-    margin[is_worse] = lonely[is_worse]
-    reason[is_worse & (decisive > 0)] = Taken.SMALL_GROUP
-    _excuse_rows(index, spacing, reach, margin)
-    if whole.is_few:
-        margin[:] = 0.0
+    tested, reach = test_cloud(index, reach_m, tests)
+    margin, reason = tested.margin, tested.reason
+    if is_too_few(len(margin), reach_m):
+        margin[:], reason[:] = 0.0, Taken.KEPT
+        return Verdict(margin, reason, tested.spacing_m, tested.curvature)
+    xyz = as_points(points)
+    sizes = sizes_of(xyz, tested.spacing_m, tested.curvature, tested.group)
+    places = doubtful_of(tested, sizes.are_large(reach))
+    few = doubtful(xyz, tested, places)
+    things = things_of(few, sizes, reach, is_whole=reach_m is None)
+    is_large = things.are_large[things.into]
+    hovers = ~is_large[few.group]
+    chosen = is_large[tested.group[index.order]]
+    gap_m = distance_to(index, chosen, few.points[hovers], GROUP * reach)
+    margin[places], reason[places] = settle(few, things, gap_m, reach)
     reason[margin <= 1.0] = Taken.KEPT
-    back = np.empty(n, np.int64)
-    back[index.order] = np.arange(n)
-    return Verdict(margin[back], reason[back], spacing[back], curvature[back], groups)
+    return Verdict(margin, reason, tested.spacing_m, tested.curvature)
 
 
-def _excuse_rows(index: Neighbourhood, spacing: Values, reach: float, margin: Values) -> None:
+def is_too_few(points: int, reach_m: float | None) -> bool:
+    """Say whether so few points have no surroundings to be judged by: all stay."""
+    return reach_m is None and points <= TESTS
+
+
+def doubtful_of(tested: Tested, are_large: Mask) -> Index:
+    """Return the places of the points that may go; `are_large` (g,) says it of their groups."""
+    return np.flatnonzero((tested.margin > 1.0) | ~are_large[tested.group])
+
+
+def doubtful(points: Points, tested: Tested, places: Index) -> Doubtful:
+    """Return the points at `places` and what is known of them."""
+    return Doubtful(
+        points[places],
+        tested.spacing_m[places],
+        tested.margin[places],
+        tested.reason[places],
+        tested.group[places],
+    )
+
+
+def things_of(few: Doubtful, sizes: Sizes, reach_m: float, *, is_whole: bool) -> Things:
+    """Return what the groups of a whole cloud are parts of.
+
+    Parameters
+    ----------
+    few : Doubtful
+        All points that may go.
+    sizes : Sizes
+        Of the groups.
+    reach_m : float
+    is_whole : bool
+        Where nothing is large, what has most points counts as large: a small thing alone is what
+        was scanned.
+    """
+    into = pieces_joined(few.points, few.group, sizes, sizes.are_large(reach_m))
+    things = sizes.merged(into)
+    are_large = things.are_large(reach_m)
+    if is_whole and len(are_large) and not are_large.any():
+        are_large = things.held == things.held.max()
+    return Things(into, are_large, things.size_m)
+
+
+def settle(
+    few: Doubtful, things: Things, gap_m: Values, reach_m: float
+) -> tuple[Values, NDArray[np.uint8]]:
+    """Return the margin (m,) and the reason (m,) of the points that may go.
+
+    gap_m (h,): from those whose thing is not large, in their order, to the nearest point of a large
+    one; at most `GROUP` reaches.
+    """
+    margin, reason = few.margin.copy(), few.reason.copy()
+    thing = things.into[few.group]
+    hovers = np.flatnonzero(~things.are_large[thing])
+    gap = np.full(len(things.size_m), np.inf)
+    np.minimum.at(gap, thing[hovers], gap_m)
+    lonely = gap[thing[hovers]] / things.size_m[thing[hovers]]
+    is_worse = lonely > margin[hovers]
+    # A point alone is alone whatever else.
+    is_named = is_worse & (reason[hovers] != Taken.ALONE)
+    margin[hovers[is_worse]] = lonely[is_worse]
+    reason[hovers[is_named]] = Taken.SMALL_GROUP
+    _excuse_rows(few.points, few.spacing_m, reach_m, margin)
+    return margin, reason
+
+
+def _excuse_rows(points: Points, spacing: Values, reach: float, margin: Values) -> None:
     """Lower the margin (n,) of points that would go but lie in a row with others that would.
 
     A wire that a scan met in a few places is nothing to its neighbours, and chance makes no rows.
@@ -220,7 +204,7 @@ def _excuse_rows(index: Neighbourhood, spacing: Values, reach: float, margin: Va
     chosen = np.flatnonzero(margin > 1.0)
     if not len(chosen):
         return
-    points = index.points[chosen]
+    points = points[chosen]
     places = knn(build_index(points), None, ROW_NEIGHBOURS, GROUP * reach)[0].astype(np.int32)
     # Where next to nothing is in reach, the spacing says so little that a row would be a road.
     usual = np.minimum(spacing[chosen], ROW_REACH * reach)
@@ -236,35 +220,3 @@ def _excuse_rows(index: Neighbourhood, spacing: Values, reach: float, margin: Va
     excused = np.full(len(chosen), np.inf)
     excused[is_sure] = math.log(ROW_ACCIDENTS) / accident[is_sure]
     margin[chosen] = np.minimum(margin[chosen], excused)
-
-
-def _neighbours(
-    index: Neighbourhood, reach_m: float | None
-) -> tuple[NDArray[np.int32], Values, float]:
-    """Return the places (n, 12) of every point's nearest, the spacing (n,) they show, the reach.
-
-    Without a `reach_m` all are searched first: what they show says how far they may be.
-    """
-    from dougong.filters.neighbourhood import blocks_of_leaves, self_knn_block
-    from dougong.kernels import protective as kernels
-
-    n = len(index.points)
-    places = np.full((n, NEIGHBOURS), -1, np.int32)
-    eighth = np.full(n, np.inf)
-    limit2 = np.inf if reach_m is None else reach_m**2
-
-    def task(first: int, last: int) -> None:
-        start, found, distance2 = self_knn_block(index, NEIGHBOURS, limit2, first, last)
-        places[start : start + len(found)] = found
-        eighth[start : start + len(found)] = np.sqrt(distance2[:, TESTS - 1])
-
-    if n:
-        for_blocks(*blocks_of_leaves(index), task)
-    reach = reach_of(lambda: (eighth,), n) if reach_m is None else reach_m
-    if reach_m is None:
-        for_blocks(
-            n,
-            _BLOCK,
-            lambda start, stop: kernels.drop_far(index.points, places, reach**2, start, stop),
-        )
-    return places, np.minimum(eighth, reach) * math.sqrt(math.pi / TESTS), reach

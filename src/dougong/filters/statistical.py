@@ -88,10 +88,12 @@ def _mean_of_nearest(xyz: Points, k: int) -> Values:
     return nearest_distances(build_index(xyz), k, len(xyz))[0]
 
 
-def nearest_distances(index: "Neighbourhood", k: int, own: int) -> tuple[Values, Values]:
+def nearest_distances(
+    index: "Neighbourhood", k: int, own: int, most_m: float = np.inf
+) -> tuple[Values, Values]:
     """Return mean and largest (own,) of the distances to the k nearest others; inf with fewer.
 
-    Of the first `own` points in the caller's order.
+    Of the first `own` points in the caller's order; nothing beyond `most_m` is near.
     """
     from dougong.filters.neighbourhood import leaves_of, self_knn_block
 
@@ -101,7 +103,7 @@ def nearest_distances(index: "Neighbourhood", k: int, own: int) -> tuple[Values,
 
     def task(start: int, stop: int) -> None:
         for block in blocks[start:stop]:
-            first, _, distance2 = self_knn_block(index, k, np.inf, *block)
+            first, _, distance2 = self_knn_block(index, k, most_m**2, *block)
             rows = index.order[first : first + len(distance2)]
             mean[rows], largest[rows] = mean_and_largest(np.sqrt(distance2))
 

@@ -182,37 +182,58 @@ def support(
 
 @kernel
 def link(
-    points: Floats, places: Small, frame: Singles, spacing: Floats, reach: float, parent: Ints
-) -> None:
-    """Join, in parent (n,), points that are neighbours within `reach` spacings of each other.
+    points: Floats,
+    places: Small,
+    frame: Singles,
+    spacing: Floats,
+    reach: float,
+    is_own: NDArray[np.bool_],
+    parent: Ints,
+    across: Ints,
+) -> int:
+    """Join, in parent (n,), own points that are neighbours within `reach` spacings of each other.
 
     Along a line the distance is divided as its frame says. parent comes as 0 .. n - 1 and leaves
-    with the root of every point's group.
+    with the root of every own point's group. Returns how many links go from an own point to one
+    that is not; as many as there is room for fill across (m, 2).
     """
     n = points.shape[0]
+    links = 0
     for i in range(n):
+        if not is_own[i]:
+            continue
         for column in range(places.shape[1]):
             j = places[i, column]
             if j < 0:
                 break
-            up, across, along = _parts2(points, frame, i, j)
+            up, other, along = _parts2(points, frame, i, j)
             far = reach * max(spacing[i], spacing[j])
-            if up + across + along / (frame[j, 8] * frame[j, 8]) <= far * far:
+            if up + other + along / (frame[j, 8] * frame[j, 8]) > far * far:
+                continue
+            if is_own[j]:
                 join(parent, i, j)
+                continue
+            if links < across.shape[0]:
+                across[links, 0], across[links, 1] = i, j
+            links += 1
     for i in range(n):
         parent[i] = root_of(parent, i)
+    return links
 
 
 @kernel
 def measure(
-    points: Floats, steps: Ints, parent: Ints, held: Ints, sums: Ints, boxes: Floats
+    points: Floats, steps: Ints, group: Ints, held: Ints, sums: Ints, boxes: Floats
 ) -> None:
-    """Fill, at every root: held (n,) points, sums (n,) of their steps (n,), boxes (n, 6)."""
+    """Fill, for every group: held (g,) points, sums (g,) of their steps (n,), boxes (g, 6).
+
+    group (n,) of each point, a place among them.
+    """
     n = points.shape[0]
     boxes[:, :3] = np.inf
     boxes[:, 3:] = -np.inf
     for i in range(n):
-        root = parent[i]
+        root = group[i]
         held[root] += 1
         sums[root] += steps[i]
         for axis in range(3):
@@ -238,16 +259,15 @@ def gaps(
     chosen: NDArray[np.bool_],
     nodes: NDArray[np.bool_],
     limit2: float,
-    asked: Ints,
+    queries: Floats,
     out: Floats,
 ) -> None:
-    """Fill out (m,): squared distance from asked points to the nearest chosen; limit2 if none."""
+    """Fill out (m,): squared distance from queries (m, 3) to the nearest chosen; limit2 if none."""
     n = points.shape[0]
     leaves = boxes.shape[0] // 2
     stack = np.empty(64, np.int64)
-    for q in range(asked.shape[0]):
-        i = asked[q]
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+    for q in range(queries.shape[0]):
+        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
         best = limit2
         stack[0] = 1
         height = 1

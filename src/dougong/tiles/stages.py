@@ -15,21 +15,22 @@ from typing import Any
 import numpy as np
 
 import dougong
-from dougong.filters import protective
 from dougong.filters.cloth_simulation import ClothSimulation, cloth_notes, guarded_cloth
 from dougong.filters.clutter import Clutter, clutter_notes
 from dougong.filters.concentration import note_of, tally
 from dougong.filters.curvature_weighted import CurvatureWeighted
 from dougong.filters.low_outliers import LowOutliers, find_levels, low_notes
 from dougong.filters.pass_through import PassThrough, robust_top_of, unknown_notes
+from dougong.filters.protective import is_too_few
 from dougong.filters.radius import Radius
 from dougong.filters.ranks import ValueBlocks, median
 from dougong.filters.selection import Reason
 from dougong.filters.statistical import Statistical, cut_distance, stray_notes
+from dougong.filters.surroundings import TESTS, reach_of
 from dougong.filters.totals import Totals
 from dougong.filters.wires import are_rows
 from dougong.params import Parameters
-from dougong.tiles import nearest, work
+from dougong.tiles import nearest, protective, work
 from dougong.tiles.cloud import (
     Arrays,
     Record,
@@ -261,35 +262,47 @@ def _curvature_weighted(stage: _Stage) -> Outcome:
 
 
 def _protective(stage: _Stage, params: CurvatureWeighted) -> Outcome:
-    asked = stage.asked
-    reach = params.reach_m
-    if reach is None:
-        _, found = stage.map("eighth", nearest.nearest, protective.TESTS)
-        reach = protective.reach_of(stage.values(found, "largest"), asked)
-    is_whole = params.reach_m is None
-    whole = protective.Whole(reach, is_few=is_whole and asked <= protective.TESTS)
-    records, key = stage.map("curvature_weighted", work.judge_protective, whole)
-    if is_whole and asked and not any(record["has_large"] for record in records):
-        # A small thing alone is what was scanned: its largest group counts as large.
-        whole = whole._replace(many=max(record["most"] for record in records))
-        records, key = stage.map("curvature_weighted", work.judge_protective, whole)
-    note = _concentration(stage, key) if asked else None
+    asked, is_whole = stage.asked, params.reach_m is None
+    reach, eighth = _reach(stage, params)
+    tiles, folder = stage.cloud.tiles, stage.cloud.folder
+    _, tested = stage.map("surroundings", protective.test_points, (eighth, reach))
+    verdicts = None
+    if not is_too_few(asked, params.reach_m):
+        things, _ = stage.kept(
+            "things",
+            lambda _: (protective.things_of(folder, tiles, tested, reach, is_whole=is_whole), {}),
+        )
+        _, gaps = stage.map("gaps", protective.gaps, (tested, things, reach))
+        verdicts, _ = stage.kept(
+            "verdicts", lambda _: (protective.settled(folder, tiles, gaps, things, reach), {})
+        )
+    records, key = stage.map("curvature_weighted", protective.judge, (tested, verdicts))
+    note = _concentration(stage, tested, key) if asked else None
     return records, () if note is None else (note,), key
 
 
-def _concentration(stage: _Stage, key: str) -> str | None:
+def _reach(stage: _Stage, params: CurvatureWeighted) -> tuple[float, str]:
+    """Return the reach, and the step of the distance to the eighth nearest other."""
+    if params.reach_m is not None:
+        _, found = stage.map("eighth", protective.eighth_within, params.reach_m)
+        return params.reach_m, found
+    _, found = stage.map("eighth", nearest.nearest, TESTS)
+    return reach_of(stage.values(found, "largest"), stage.asked), found
+
+
+def _concentration(stage: _Stage, tested: str, key: str) -> str | None:
     """Return what is to be said where removal concentrates on fine geometry."""
-    spacing_m = median(stage.values(key, "spacing"))
+    spacing_m = median(stage.values(tested, "spacing"))
     if not spacing_m > 0:
         return None
     found = None
     for tile, points in zip(stage.cloud.tiles, stage.blocks(), strict=True):
         if not len(points):
             continue
-        mask = stage.mask(tile)
-        after = read_arrays(stage.cloud.folder, tile, key, "code", "curvature")
-        is_kept = after["code"][mask] == Reason.KEPT
-        part = tally(points, is_kept, after["curvature"], spacing_m)
+        code = read_arrays(stage.cloud.folder, tile, key, "code")["code"]
+        is_kept = code[stage.mask(tile)] == Reason.KEPT
+        curvature = read_arrays(stage.cloud.folder, tile, tested, "curvature")["curvature"]
+        part = tally(points, is_kept, curvature, spacing_m)
         found = part if found is None else found.merged(part)
     return None if found is None else note_of(found)
 

@@ -21,11 +21,8 @@ from dougong.filters.curvature_weighted import (
     own_totals,
 )
 from dougong.filters.curvature_weighted import halo_m as curvature_halo_m
-from dougong.filters.curvature_weighted import judge_protective as judge_rule
 from dougong.filters.low_outliers import Levels, is_low_outlier
 from dougong.filters.pass_through import PassThrough, pass_through
-from dougong.filters.protective import Whole
-from dougong.filters.protective import halo_m as protective_halo_m
 from dougong.filters.radius import Radius, radius
 from dougong.filters.selection import Reason, Selection, details_of
 from dougong.filters.statistical import Statistical, mean_distances, select_near
@@ -44,7 +41,7 @@ def _own(selection: Selection, own: int) -> Selection:
     )
 
 
-def _booked(
+def booked(
     job: Job, selection: Selection, reason: Reason, **more: NDArray[Any]
 ) -> tuple[Arrays, Record]:
     """Return the state of the tile after a stage, and its counts."""
@@ -61,14 +58,14 @@ def _booked(
 def judge_low(job: Job) -> tuple[Arrays, Record]:
     """Low outliers; known: the file of the levels."""
     is_low = is_low_outlier(asked_points(job, job.tile), load_levels(job.folder, job.known))
-    return _booked(job, Selection(is_kept=~is_low), Reason.LOW_OUTLIER)
+    return booked(job, Selection(is_kept=~is_low), Reason.LOW_OUTLIER)
 
 
 def judge_cloth(job: Job) -> tuple[Arrays, Record]:
     """Ground or not; known: the file of the cloth."""
     assert isinstance(job.params, ClothSimulation)
     found = classify(asked_points(job, job.tile), load_cloth(job.folder, job.known), job.params)
-    arrays, record = _booked(job, found, Reason.CLOTH)
+    arrays, record = booked(job, found, Reason.CLOTH)
     places = np.flatnonzero(asked_of(job.folder, job.tile, job.before, job.among))
     arrays["ground"][places] = found.attributes["ground_class"]
     arrays["height"] = np.full(job.tile.points, np.nan)
@@ -81,7 +78,7 @@ def judge_radius(job: Job) -> tuple[Arrays, Record]:
     """Too few neighbours in a ball."""
     assert isinstance(job.params, Radius)
     part = with_halo(job, job.params.radius_m)
-    return _booked(job, _own(radius(part.points, job.params), part.own), Reason.RADIUS)
+    return booked(job, _own(radius(part.points, job.params), part.own), Reason.RADIUS)
 
 
 def count_lines(job: Job) -> tuple[Arrays, Record]:
@@ -105,7 +102,7 @@ def judge_clutter(job: Job) -> tuple[Arrays, Record]:
     part = with_halo(job, clutter_halo_m(job.params), more=("height",))
     whole = clutter_search.Whole(part.own, job.known)
     found = clutter(part.points, job.params, height_above_ground=_height(part), whole=whole)
-    arrays, record = _booked(job, _own(found, part.own), Reason.CLUTTER)
+    arrays, record = booked(job, _own(found, part.own), Reason.CLUTTER)
     return arrays, {**record, "found": dict(found.found)}
 
 
@@ -113,7 +110,7 @@ def judge_statistical(job: Job) -> tuple[Arrays, Record]:
     """Too far from the neighbours; known: the stage of the mean distances, and the cut."""
     stage, cut = job.known
     mean_m = read_arrays(job.folder, job.tile, stage, "mean")["mean"]
-    return _booked(job, select_near(mean_m, cut), Reason.STATISTICAL)
+    return booked(job, select_near(mean_m, cut), Reason.STATISTICAL)
 
 
 def judge_pass_through(job: Job) -> tuple[Arrays, Record]:
@@ -124,7 +121,7 @@ def judge_pass_through(job: Job) -> tuple[Arrays, Record]:
     found = pass_through(
         asked_points(job, job.tile), job.params, height_above_ground=height, top_m=job.known
     )
-    arrays, record = _booked(job, found, Reason.PASS_THROUGH)
+    arrays, record = booked(job, found, Reason.PASS_THROUGH)
     is_needed = job.params.needs_height and height is not None
     unknown = int(np.isnan(state["height"][is_asked(state, job.among)]).sum()) if is_needed else 0
     return arrays, {**record, "unknown": unknown}
@@ -140,7 +137,7 @@ def judge_curvature(job: Job) -> tuple[Arrays, Record]:
         voxel_count=part.more.get("voxel_count"),
         whole=None if job.known is None else Totals(*job.known),
     )
-    return _booked(job, _own(found, part.own), Reason.CURVATURE_WEIGHTED)
+    return booked(job, _own(found, part.own), Reason.CURVATURE_WEIGHTED)
 
 
 def count_curvature(job: Job) -> tuple[Arrays, Record]:
@@ -149,24 +146,6 @@ def count_curvature(job: Job) -> tuple[Arrays, Record]:
     part = with_halo(job, curvature_halo_m(job.params))
     totals = own_totals(part.points, job.params, part.own)
     return {}, {"totals": [totals.count, totals.total, totals.squares]}
-
-
-def judge_protective(job: Job) -> tuple[Arrays, Record]:
-    """CWASF, rule protective; known: a `Whole`, whose own is not filled in."""
-    assert isinstance(job.params, CurvatureWeighted)
-    assert isinstance(job.known, Whole)
-    part = with_halo(job, protective_halo_m(job.known.reach_m))
-    whole = job.known._replace(own=part.own)
-    found, groups = judge_rule(part.points, job.params, part.more.get("voxel_count"), whole)
-    own = _own(found, part.own)
-    arrays, record = _booked(
-        job,
-        own,
-        Reason.CURVATURE_WEIGHTED,
-        curvature=own.attributes["curvature"],
-        spacing=own.attributes["spacing_m"],
-    )
-    return arrays, {**record, "has_large": groups.has_large, "most": groups.most}
 
 
 def mean_within(job: Job) -> tuple[Arrays, Record]:
