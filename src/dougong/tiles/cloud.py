@@ -5,10 +5,12 @@ stage's key. A file that is there is whole, see `Folder`.
 """
 
 import json
+import os
+import struct
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +26,8 @@ POINTS = "points"
 INDEX = "tiles.json"
 """The file that says that the tiles are whole: it is written last."""
 _RECORD = "record"
+_HEADER_BYTES, _NAME_AND_EXTRA = 30, 26
+"""Of a member of a zip file, and where it says how long its name and what follows are."""
 
 
 class Tile(NamedTuple):
@@ -101,11 +105,23 @@ def read_arrays(
 
 def read_file(folder: Folder, file_name: str, *names: str, if_there: bool = False) -> Arrays:
     """Return the arrays `names` of a file, or all of them; `if_there`: those that it has."""
-    with folder.open(file_name) as file, np.load(file) as stored:
-        wanted = names or stored.files
-        if if_there:
-            wanted = [name for name in wanted if name in stored.files]
-        return {name: stored[name] for name in wanted if name != _RECORD}
+    with folder.open(file_name) as file, zipfile.ZipFile(file) as stored:
+        there = {info.filename.removesuffix(".npy"): info for info in stored.infolist()}
+        wanted = [name for name in names or there if name in there or not if_there]
+        return {name: _read_member(file, there[name]) for name in wanted if name != _RECORD}
+
+
+def _read_member(file: IO[bytes], info: zipfile.ZipInfo) -> NDArray[Any]:
+    """Return an array of a file of arrays, straight from where it is stored.
+
+    A third of the time that `zipfile` takes: tiles read their neighbours again and again.
+    """
+    assert info.compress_type == zipfile.ZIP_STORED
+    file.seek(info.header_offset)
+    header = file.read(_HEADER_BYTES)
+    file.seek(sum(struct.unpack_from("<HH", header, _NAME_AND_EXTRA)), os.SEEK_CUR)
+    array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+    return array
 
 
 def read_record(folder: Folder, file_name: str) -> Record | None:

@@ -108,25 +108,40 @@ def with_halo(
     step, found : str, optional
         An earlier step of the stage and an array of it, one value per point that was asked about.
     """
-    points, places, tiles = [], [], []
-    values: dict[str, list[NDArray[Any]]] = {}
-    numbers = {tile: number for number, tile in enumerate(cloud_of(job).tiles)}
-    for tile in (job.tile, *cloud_of(job).near(job.tile, halo_m)):
-        xyz = asked_points(job, tile)
-        is_read = None if tile == job.tile else np.flatnonzero(in_box(xyz, job.tile, halo_m))
-        points.append(xyz if is_read is None else xyz[is_read])
-        if is_read is not None:
-            places.append(is_read)
-            tiles.append(np.full(len(is_read), numbers[tile]))
-        for name, held in _more(job, tile, more, step, found).items():
-            values.setdefault(name, []).append(held if is_read is None else held[is_read])
+    points = [asked_points(job, job.tile)]
+    places, tiles = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    values = {name: [held] for name, held in _more(job, job.tile, more, step, found).items()}
+    for number, tile in enumerate(cloud_of(job).tiles):
+        if tile == job.tile or not job.tile.is_near(tile, halo_m):
+            continue
+        xyz, place = _asked_in_box(job, tile, halo_m)
+        points.append(xyz)
+        places.append(place)
+        tiles.append(np.full(len(place), number))
+        if len(place):
+            for name, held in _more(job, tile, more, step, found).items():
+                values[name].append(held[place])
     return Part(
         points=np.ascontiguousarray(np.concatenate(points)),
         own=len(points[0]),
         more={name: np.concatenate(held) for name, held in values.items()},
-        place=np.concatenate([np.zeros(0, np.int64), *places]),
-        tile=np.concatenate([np.zeros(0, np.int64), *tiles]),
+        place=np.concatenate(places),
+        tile=np.concatenate(tiles),
     )
+
+
+def _asked_in_box(job: Job, tile: Tile, wider_m: float) -> tuple[Points, Index]:
+    """Return the asked points of another tile within `wider_m` of the job's tile, and their places.
+
+    A place is one among the points of their tile that are asked about.
+    """
+    xyz: Points = read_arrays(job.folder, tile, POINTS, "xyz")["xyz"]
+    rows = np.flatnonzero(in_box(xyz, job.tile, wider_m))
+    if not len(rows):
+        return xyz[:0], rows
+    chosen = asked_of(job.folder, tile, job.before, job.among)
+    rows = rows[chosen[rows]]
+    return xyz[rows], (np.cumsum(chosen) - 1)[rows]
 
 
 def _more(job: Job, tile: Tile, more: tuple[str, ...], step: str, found: str) -> Arrays:

@@ -33,14 +33,14 @@ _FEW = tuple(f"few_{name}" for name in Doubtful._fields)
 
 
 def eighth_within(job: Job) -> tuple[Arrays, Record]:
-    """Distance to the eighth nearest other, infinite beyond the reach; known: the reach."""
+    """Distance to the eighth nearest other, infinite beyond a limit; known: the limit."""
     part = with_halo(job, job.known * _SLACK)
     index = build_index(part.points)
     return {"largest": nearest_distances(index, TESTS, part.own, job.known)[1]}, {}
 
 
 def test_points(job: Job) -> tuple[Arrays, Record]:
-    """Test a tile's points; known: the step of the eighth nearest, and the reach.
+    """Test a tile's points; known: the step of `eighth_within`, and the reach.
 
     Leaves of every point what the tests say and its group, and tables of the groups, of the links
     across the border, and of the points that may go.
@@ -48,10 +48,7 @@ def test_points(job: Job) -> tuple[Arrays, Record]:
     assert isinstance(job.params, CurvatureWeighted)
     step, reach = job.known
     part = with_halo(job, HALO * reach * _SLACK, step=step, found="largest")
-    eighth = part.more["largest"]
-    if job.asked <= TESTS:
-        eighth = np.full(len(eighth), np.inf)
-    tested = test_part(part.points, eighth, part.own, reach, job.params.tests)
+    tested = test_part(part.points, part.more["largest"], part.own, reach, job.params.tests)
     own = part.points[: part.own]
     sizes = sizes_of(own, tested.spacing_m, tested.curvature, tested.group)
     place = protective.doubtful_of(tested, sizes.are_large(reach))

@@ -23,10 +23,10 @@ from dougong.filters.low_outliers import LowOutliers, find_levels, low_notes
 from dougong.filters.pass_through import PassThrough, robust_top_of, unknown_notes
 from dougong.filters.protective import is_too_few
 from dougong.filters.radius import Radius
-from dougong.filters.ranks import ValueBlocks, median
+from dougong.filters.ranks import ValueBlocks, count_finite, median
 from dougong.filters.selection import Reason
 from dougong.filters.statistical import Statistical, cut_distance, stray_notes
-from dougong.filters.surroundings import TESTS, reach_of
+from dougong.filters.surroundings import REACH_M, TESTS, reach_of
 from dougong.filters.totals import Totals
 from dougong.filters.wires import are_rows
 from dougong.params import Parameters
@@ -282,12 +282,24 @@ def _protective(stage: _Stage, params: CurvatureWeighted) -> Outcome:
 
 
 def _reach(stage: _Stage, params: CurvatureWeighted) -> tuple[float, str]:
-    """Return the reach, and the step of the distance to the eighth nearest other."""
+    """Return the reach, and the step of the distance to the eighth nearest other within it.
+
+    Where it is taken from the cloud, nobody looks farther for that than half of its points need.
+    """
     if params.reach_m is not None:
         _, found = stage.map("eighth", protective.eighth_within, params.reach_m)
         return params.reach_m, found
-    _, found = stage.map("eighth", nearest.nearest, TESTS)
-    return reach_of(stage.values(found, "largest"), stage.asked), found
+    within = REACH_M
+    while True:
+        _, found = stage.map("eighth", protective.eighth_within, within)
+        eighth = stage.values(found, "largest")
+        if stage.asked <= TESTS or count_finite(eighth) > stage.asked // 2:
+            reach = reach_of(eighth, stage.asked)
+            if reach <= within:
+                return reach, found
+            within = reach
+        else:
+            within *= 2.0
 
 
 def _concentration(stage: _Stage, tested: str, key: str) -> str | None:
