@@ -86,7 +86,7 @@ def test_children_halve_a_tile():
 
 def test_rows_come_back_bit_for_bit(tmp_path):
     cloud = site(300)
-    file = RowFile(tmp_path / "a.arrows", cloud.records.dtype)
+    file = RowFile(tmp_path / "a.rows", cloud.records.dtype)
     for a, b in ((0, 100), (100, 101), (101, len(cloud))):
         file.append(Rows(np.arange(a, b), cloud.xyz[a:b], cloud.records[a:b]))
     back = file.read()
@@ -98,7 +98,7 @@ def test_rows_come_back_bit_for_bit(tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path):
     cloud = site(100)
-    file = RowFile(tmp_path / "missing" / "a.arrows", cloud.records.dtype)
+    file = RowFile(tmp_path / "missing" / "a.rows", cloud.records.dtype)
     with pytest.raises(OutputError, match="could not be written"):
         file.append(Rows(np.arange(len(cloud)), cloud.xyz, cloud.records))
 

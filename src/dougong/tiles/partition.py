@@ -82,8 +82,12 @@ def partition(
 
 def _sample_and_far(spool: Spool) -> tuple[Points, int]:
     """Return the sample that shapes the cloud's box, and how many points lie far from it."""
-    step = sample_step(spool.points)
-    sample = np.concatenate([rows.xyz[rows.row % step == 0] for rows in spool.pieces()])
+    step, start = sample_step(spool.points), 0
+    parts = []
+    for xyz in spool.blocks():
+        parts.append(xyz[-start % step :: step].copy())
+        start += len(xyz)
+    sample = np.concatenate(parts)
     box = robust_box(sample)
     return sample, sum(points_beyond(xyz, *box) for xyz in spool.blocks())
 

@@ -34,7 +34,8 @@ class Spool:
 
     def blocks(self) -> Iterator[Points]:
         """Yield the coordinates from the beginning."""
-        return (rows.xyz for rows in self.pieces())
+        assert self._file is not None
+        return self._file.coordinates()
 
     def cut(self, grid: TileGrid, most: int) -> Iterator[RowFile]:
         """Cut the cloud into tiles, see `cut`. The spool is used up."""

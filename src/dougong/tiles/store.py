@@ -1,22 +1,27 @@
-"""Tiles on disk: rows of points in Arrow files that grow by appending.
+"""Tiles on disk: rows of points in files that grow by appending.
 
-A file is a chain of Arrow streams, one per append, so any number of tiles can grow at once without
-being open, and a file is read back in the pieces it was written in. Nothing is compressed: that
-costs twice what all else here does, for rows that are read once or twice and deleted.
+A file is a chain of blocks, one per append: how many rows, then their places, coordinates and
+records, as they lie in memory. So any number of tiles can grow at once without being open, a file
+is read back in the pieces it was written in, and coordinates are read without the records. Nothing
+is compressed: that costs twice what all else here does, for rows that are read once or twice and
+deleted.
 """
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import IO, Any, NamedTuple, TypeAlias
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from dougong.cloud import Records, chosen_rows
 from dougong.errors import OutputError
 from dougong.typing import Index, Points
+
+_COUNT = np.dtype("<i8")
+_ROW_BYTES, _XYZ_BYTES = 8, 24
 
 
 class Rows(NamedTuple):
@@ -49,65 +54,78 @@ class RowFile:
         OutputError
             The disk is full, or the folder cannot be written.
         """
-        batch = _to_batch(rows)
-        with (
-            _told(self.path),
-            self.path.open("ab") as file,
-            pa.ipc.new_stream(file, batch.schema) as writer,
-        ):
-            writer.write_batch(batch)
+        with _told(self.path), self.path.open("ab") as file:
+            file.write(np.array(len(rows.row), _COUNT).tobytes())
+            for values in rows:
+                file.write(_bytes_of(np.ascontiguousarray(values)))
 
     def pieces(self) -> Iterator[Rows]:
         """Yield the rows in the pieces they were appended in."""
-        with pa.OSFile(str(self.path), "rb") as file:
-            while file.tell() < file.size():
-                yield from _read_stream(file, self.layout)
+        with self.path.open("rb") as file:
+            for count in _counts(file):
+                rows = self._empty(count)
+                _fill(file, rows, slice(None))
+                yield rows
+
+    def coordinates(self) -> Iterator[Points]:
+        """Yield the coordinates of the pieces; the records are not read."""
+        with self.path.open("rb") as file:
+            for count in _counts(file):
+                xyz = np.empty((count, 3))
+                file.seek(count * _ROW_BYTES, os.SEEK_CUR)
+                _read_into(file, xyz)
+                file.seek(count * self.layout.itemsize, os.SEEK_CUR)
+                yield xyz
 
     def read(self) -> Rows:
         """Return all rows."""
-        return concatenate(list(self.pieces()))
+        with self.path.open("rb") as file:
+            counts = []
+            for count in _counts(file):
+                counts.append(count)
+                file.seek(count * self._bytes_per_row, os.SEEK_CUR)
+            rows = self._empty(sum(counts))
+            file.seek(0)
+            start = 0
+            for count in _counts(file):
+                _fill(file, rows, slice(start, start + count))
+                start += count
+        return rows
 
     def remove(self) -> None:
         """Delete the file."""
         self.path.unlink()
 
+    @property
+    def _bytes_per_row(self) -> int:
+        return _ROW_BYTES + _XYZ_BYTES + self.layout.itemsize
 
-def concatenate(parts: list[Rows]) -> Rows:
-    """Return the rows of at least one part as one."""
-    if len(parts) == 1:
-        return parts[0]
-    row, xyz, records = zip(*parts, strict=True)
-    return Rows(np.concatenate(row), np.concatenate(xyz), np.concatenate(records))
-
-
-def _to_batch(rows: Rows) -> pa.RecordBatch:
-    columns = [pa.array(rows.row), _packed(rows.xyz), _packed(rows.records)]
-    return pa.record_batch(columns, names=list(Rows._fields))
+    def _empty(self, count: int) -> Rows:
+        return Rows(np.empty(count, np.int64), np.empty((count, 3)), np.empty(count, self.layout))
 
 
-def _packed(values: NDArray[Any]) -> pa.Array:
-    """Return an array of rows, whatever they hold, as a column of bytes: no copy is made."""
-    held = np.ascontiguousarray(values)
-    width = held.nbytes // max(len(held), 1)
-    data = pa.py_buffer(held.reshape(-1).view(np.uint8))
-    return pa.Array.from_buffers(pa.binary(width), len(held), [None, data])
+def _counts(file: IO[bytes]) -> Iterator[int]:
+    """Yield how many rows each block has, the file being read up to them."""
+    while head := file.read(_COUNT.itemsize):
+        yield int(np.frombuffer(head, _COUNT)[0])
 
 
-def _unpacked(column: pa.Array, layout: np.dtype[Any]) -> NDArray[Any]:
-    """Return the rows of a column of bytes."""
-    width = column.type.byte_width
-    start = column.offset * width
-    data = column.buffers()[1][start : start + len(column) * width]
-    return np.frombuffer(data, dtype=layout)
+def _fill(file: IO[bytes], rows: Rows, part: slice) -> None:
+    """Read a block into a part of `rows`."""
+    for values in rows:
+        _read_into(file, values[part])
 
 
-def _read_stream(file: pa.NativeFile, layout: np.dtype[Any]) -> Iterator[Rows]:
-    for batch in pa.ipc.open_stream(file):
-        yield Rows(
-            row=batch.column("row").to_numpy(zero_copy_only=True),
-            xyz=_unpacked(batch.column("xyz"), np.dtype(np.float64)).reshape(-1, 3),
-            records=_unpacked(batch.column("records"), layout),
-        )
+def _read_into(file: IO[bytes], values: NDArray[Any]) -> None:
+    into = _bytes_of(values)
+    if file.readinto(into) != len(into):  # type: ignore[attr-defined]
+        msg = f"{file.name} was cut short while it was in use. Delete its folder and start again."
+        raise OutputError(msg)
+
+
+def _bytes_of(values: NDArray[Any]) -> memoryview:
+    """Return rows, whatever they hold, as bytes: no copy is made."""
+    return values.reshape(-1).view(np.uint8).data
 
 
 @contextmanager
@@ -133,6 +151,6 @@ def make_row_file(folder: Path) -> RowFileMaker:
         folder.mkdir(parents=True, exist_ok=True)
 
     def make(name: str, layout: np.dtype[Any]) -> RowFile:
-        return RowFile(folder / f"{name}.arrows", layout)
+        return RowFile(folder / f"{name}.rows", layout)
 
     return make
