@@ -4,7 +4,8 @@ Tiles are nodes of the octree whose leaves are the voxels of a grid. A tile of l
 voxels wide; its eight children are the tiles of level k - 1 inside it.
 """
 
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 from dougong.typing import Index, Points
 
 MOST_LEVELS = 40
+_FINER = 3
+"""So many levels at once are looked into when crowded tiles are halved."""
 
 
 class TileGrid(NamedTuple):
@@ -69,15 +72,90 @@ def part(points: Points, grid: TileGrid) -> Parts:
     return Parts(order, np.append(starts, len(points)), np.ascontiguousarray(ordered[:, starts].T))
 
 
-def _keys(columns: list[NDArray[np.int64]]) -> NDArray[np.uint16] | None:
-    """Return one short number per tile, in the order of the tiles; None where they are too many.
+def _keys(columns: list[NDArray[np.int64]]) -> NDArray[Any] | None:
+    """Return one number per tile, in the order of the tiles; None where they are too far apart.
 
     NumPy sorts short numbers by radix, twenty times faster than by three columns.
     """
     lows = [int(column.min()) for column in columns]
     sizes = [int(column.max()) - low + 1 for column, low in zip(columns, lows, strict=True)]
-    if sizes[0] * sizes[1] * sizes[2] > 1 << 16:
+    cells = sizes[0] * sizes[1] * sizes[2]
+    if cells > 1 << 62:
         return None
     x, y, z = (column - low for column, low in zip(columns, lows, strict=True))
-    keys: NDArray[np.uint16] = ((x * sizes[1] + y) * sizes[2] + z).astype(np.uint16)
-    return keys
+    keys = (x * sizes[1] + y) * sizes[2] + z
+    return keys.astype(np.uint16) if cells <= 1 << 16 else keys
+
+
+class Leaves(NamedTuple):
+    """Tiles of several levels: the widest that hold no more points than they may."""
+
+    grid: TileGrid
+    """Whose tiles, as narrow as any of them, are `nodes`."""
+    nodes: NDArray[np.int64]
+    """(m, 3) all that hold points, sorted."""
+    leaf: Index
+    """(m,) the place in `names` of the tile that each is a part of."""
+    names: tuple[tuple[int, int, int, int], ...]
+    """Level and coordinates of each tile, in the order of coordinates."""
+    counts: Index
+    """Points of each tile: more than allowed only in the narrowest ones."""
+
+    def part(self, points: Points) -> Parts:
+        """Sort `points` (n, 3) of the cloud by their tile; `tiles` are places in `names`."""
+        parts = part(points, self.grid)
+        leaf = self.leaf[_rows_in(self.nodes, parts.tiles)]
+        short = np.uint16 if len(self.names) <= 1 << 16 else np.int64
+        of_point = np.empty(len(points), short)
+        of_point[parts.order] = np.repeat(leaf, np.diff(parts.starts))
+        order = np.argsort(of_point, kind="stable")
+        held = np.bincount(of_point, minlength=len(self.names))
+        tiles = np.flatnonzero(held)
+        return Parts(order, np.concatenate([[0], np.cumsum(held[tiles])]), tiles)
+
+
+def leaves_of(blocks: Iterable[Points], grid: TileGrid, most: int) -> Leaves:
+    """Return the tiles of a cloud that comes in blocks, at most `_FINER` levels below the grid's.
+
+    One pass. A tile of more than `most` points is halved along every axis.
+    """
+    fine = grid._replace(level=max(0, grid.level - _FINER))
+    nodes, counts = np.empty((0, 3), np.int64), np.empty(0, np.int64)
+    for block in blocks:
+        if not len(block):
+            continue
+        parts = part(block, fine)
+        nodes, of_node = np.unique(
+            np.concatenate([nodes, parts.tiles]), axis=0, return_inverse=True
+        )
+        counts = np.bincount(
+            of_node.reshape(-1), np.concatenate([counts, np.diff(parts.starts)])
+        ).astype(np.int64)
+    level = np.full(len(nodes), fine.level)
+    for wider in range(fine.level + 1, grid.level + 1):
+        _, inside = np.unique(nodes >> (wider - fine.level), axis=0, return_inverse=True)
+        inside = inside.reshape(-1)
+        level[np.bincount(inside, counts)[inside] <= most] = wider
+    tiles = np.column_stack([level, nodes >> (level - fine.level)[:, None]])
+    found, leaf = np.unique(tiles, axis=0, return_inverse=True)
+    names = [tuple(name) for name in found.tolist()]
+    order = sorted(range(len(names)), key=lambda i: _path(names[i], grid.level))
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    leaf = rank[leaf.reshape(-1)]
+    held = np.bincount(leaf, counts).astype(np.int64)
+    return Leaves(fine, nodes, leaf, tuple(names[i] for i in order), held)
+
+
+def _path(name: tuple[int, ...], top: int) -> list[tuple[int, ...]]:
+    """Return the coordinates of the tiles that hold a tile, from the widest level down."""
+    level, *at = name
+    return [tuple(axis >> up for axis in at) for up in range(top - level, -1, -1)]
+
+
+def _rows_in(nodes: NDArray[np.int64], wanted: NDArray[np.int64]) -> Index:
+    """Return the rows of sorted `nodes` (m, 3) that `wanted` (k, 3) are."""
+    both, inverse = np.unique(np.concatenate([nodes, wanted]), axis=0, return_inverse=True)
+    assert len(both) == len(nodes)
+    rows: Index = inverse.reshape(-1)[len(nodes) :]
+    return rows

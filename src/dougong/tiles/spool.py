@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from dougong.cloud import Cloud
-from dougong.tiles.grid import TileGrid, part
+from dougong.tiles.grid import TileGrid, leaves_of
 from dougong.tiles.store import RowFile, RowFileMaker, Rows, make_row_file
 from dougong.typing import Points
 
@@ -49,20 +49,20 @@ def cut(file: RowFile, grid: TileGrid, most: int, make: RowFileMaker) -> Iterato
     The file is used up. Tiles are yielded in the order of their coordinates; whoever takes one
     removes it. A tile of one voxel is never halved, however many points lie in it.
     """
-    tiles: dict[tuple[int, ...], RowFile] = {}
-    counts: dict[tuple[int, ...], int] = {}
+    leaves = leaves_of(file.coordinates(), grid, most)
+    tiles: dict[int, RowFile] = {}
     for rows in file.pieces():
-        parts = part(rows.xyz, grid)
-        for index, key in enumerate(map(tuple, parts.tiles.tolist())):
+        parts = leaves.part(rows.xyz)
+        for index, leaf in enumerate(parts.tiles.tolist()):
             chosen = parts.order[parts.starts[index] : parts.starts[index + 1]]
-            if key not in tiles:
-                name = "_".join(map(str, (grid.level, *key)))
-                tiles[key] = make(name, file.layout)
-            tiles[key].append(rows.take(chosen))
-            counts[key] = counts.get(key, 0) + len(chosen)
+            if leaf not in tiles:
+                name = "_".join(map(str, leaves.names[leaf]))
+                tiles[leaf] = make(name, file.layout)
+            tiles[leaf].append(rows.take(chosen))
     file.remove()
-    for key in sorted(tiles):
-        if counts[key] > most and grid.level > 0:
-            yield from cut(tiles[key], grid.children(), most, make)
+    for leaf in sorted(tiles):
+        level = leaves.names[leaf][0]
+        if leaves.counts[leaf] > most and level > 0:
+            yield from cut(tiles[leaf], grid._replace(level=level - 1), most, make)
         else:
-            yield tiles[key]
+            yield tiles[leaf]
