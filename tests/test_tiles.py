@@ -16,7 +16,7 @@ from dougong.threads import set_threads
 from dougong.tiles.cloud import read_arrays
 from dougong.tiles.engine import set_engine
 from dougong.tiles.folder import LocalFolder
-from dougong.tiles.grid import TileGrid, grid_for, part
+from dougong.tiles.grid import TileGrid, grid_for, leaves_of, part
 from dougong.tiles.partition import partition
 from dougong.tiles.spool import Spool
 from dougong.tiles.store import RowFile, Rows
@@ -84,6 +84,37 @@ def test_children_halve_a_tile():
     assert {tuple(t) for t in (fine >> 1)} == {tuple(t) for t in coarse}
 
 
+def halved(points, grid, most, rows, least):
+    """Return the tiles of points, by name, as halving crowded ones down to a level gives them."""
+    found = {}
+    parts = part(points[rows], grid)
+    for k, at in enumerate(parts.tiles.tolist()):
+        mine = rows[parts.order[parts.starts[k] : parts.starts[k + 1]]]
+        if len(mine) > most and grid.level > least:
+            found |= halved(points, grid.children(), most, mine, least)
+        else:
+            found[(grid.level, *at)] = mine
+    return found
+
+
+@pytest.mark.parametrize("far", [0.0, 900.0, 1e7])
+def test_a_cloud_is_cut_at_once_as_halving_crowded_tiles_would(far):
+    rng = np.random.default_rng(1)
+    points = np.vstack([rng.normal(0, 9.0, (3000, 3)), rng.normal(5, 0.3, (2000, 3))])
+    points[:2] += far
+    grid = TileGrid(np.full(3, -20.0), 0.05, 9)
+    expected = halved(points, grid, 400, np.arange(len(points)), grid.level - 3)
+    leaves = leaves_of([points[:1700], points[1700:1700], points[1700:]], grid, 400)
+    assert list(leaves.names) == list(expected)
+    assert leaves.counts.tolist() == [len(rows) for rows in expected.values()]
+    some = np.arange(0, len(points), 3)
+    parts = leaves.part(points[some])
+    for k, leaf in enumerate(parts.tiles.tolist()):
+        mine = some[parts.order[parts.starts[k] : parts.starts[k + 1]]]
+        wanted = expected[leaves.names[leaf]]
+        np.testing.assert_array_equal(mine, wanted[np.isin(wanted, some)])
+
+
 def test_rows_come_back_bit_for_bit(tmp_path):
     cloud = site(300)
     file = RowFile(tmp_path / "a.rows", cloud.records.dtype)
@@ -91,6 +122,7 @@ def test_rows_come_back_bit_for_bit(tmp_path):
         file.append(Rows(np.arange(a, b), cloud.xyz[a:b], cloud.records[a:b]))
     back = file.read()
     assert len(list(file.pieces())) == 3
+    np.testing.assert_array_equal(np.concatenate(list(file.coordinates())), cloud.xyz)
     np.testing.assert_array_equal(back.row, np.arange(len(cloud)))
     np.testing.assert_array_equal(back.xyz, cloud.xyz)
     assert back.records.tobytes() == cloud.records.tobytes()
@@ -101,6 +133,16 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path):
     file = RowFile(tmp_path / "missing" / "a.rows", cloud.records.dtype)
     with pytest.raises(OutputError, match="could not be written"):
         file.append(Rows(np.arange(len(cloud)), cloud.xyz, cloud.records))
+
+
+def test_a_file_that_was_cut_short_is_no_cloud(tmp_path):
+    cloud = site(100)
+    file = RowFile(tmp_path / "a.rows", cloud.records.dtype)
+    file.append(Rows(np.arange(len(cloud)), cloud.xyz, cloud.records))
+    with file.path.open("r+b") as stored:
+        stored.truncate(file.path.stat().st_size - 1)
+    with pytest.raises(OutputError, match="cut short"):
+        file.read()
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from dougong.filters import FILTERS
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
 from dougong.filters.radius import Radius
 from dougong.filters.selection import Reason, details_of
-from dougong.tiles import work
+from dougong.tiles import nearest, work
 from dougong.tiles.cloud import load_tiles, read_arrays
 from dougong.tiles.engine import Task, local_engine
 from dougong.tiles.folder import LocalFolder
@@ -88,6 +88,87 @@ def test_tiles_judge_as_the_whole(tmp_path, name, values, most):
     if name == "cloth_simulation":
         np.testing.assert_array_equal(found["ground"], expected.attributes["ground_class"])
         np.testing.assert_array_equal(found["height"], expected.attributes["height_above_ground"])
+
+
+def things():
+    """What no tile sees whole: wires, chains in pieces, clumps and a stele before a wall."""
+    rng = np.random.default_rng(5)
+    wall = np.column_stack(
+        [rng.uniform(0, 8, 3000), 0.003 * rng.normal(size=3000), rng.uniform(0, 5, 3000)]
+    )
+    wire = np.column_stack([np.arange(0, 8, 0.02), np.full(400, -1.5), np.full(400, 3.0)])
+    links = [rng.normal([x, -1.0, 1.0], 0.02, (14, 3)) for x in np.arange(0.5, 3.5, 0.06)]
+    clumps = [rng.normal(c, 0.05, (40, 3)) for c in rng.uniform([0, -2, 0], [8, -0.8, 5], (12, 3))]
+    stele = np.column_stack(
+        [rng.uniform(5, 5.4, 260), np.full(260, -1.2), rng.uniform(0.5, 1.3, 260)]
+    )
+    row = np.column_stack([np.arange(0.3, 7, 0.15), np.full(45, -0.9), np.full(45, 4.2)])
+    strays = rng.uniform([0, -3, 0], [8, 3, 6], (60, 3))
+    return np.vstack([wall, wire, *links, *clumps, stele, row, strays])
+
+
+SMALL_ALONE = np.vstack(
+    [
+        np.random.default_rng(1).uniform([0, 0, 0], [0.4, 0.001, 0.4], (400, 3)),
+        [[1.5, 0.4, 0.1], [0.2, -1.2, 0.3]],
+    ]
+)
+SPARSE = np.random.default_rng(2).uniform([0, 0, 0], [60, 0.01, 60], (2500, 3))
+DENSE = np.random.default_rng(3).uniform([0, 0, 0], [0.3, 0.001, 0.3], (20_000, 3))
+
+
+@pytest.mark.parametrize(
+    ("points", "reach_m", "most"),
+    [
+        (things(), None, 150),
+        (things(), 0.2, 250),
+        (SMALL_ALONE, None, 40),
+        (SMALL_ALONE, 0.3, 40),
+        (SPARSE, None, 150),
+        (DENSE, None, 1500),
+        (SMALL_ALONE[:8], None, 3),
+        (SMALL_ALONE[:9], 0.5, 3),
+    ],
+)
+def test_things_across_tiles_are_judged_as_wholes(tmp_path, points, reach_m, most):
+    params = FILTERS["curvature_weighted"].params(reach_m=reach_m)
+    cloud, whole = tiled(points, tmp_path, most)
+    assert len(cloud.tiles) >= min(len(points) // most, 3)
+    expected = FILTERS["curvature_weighted"].verb(whole.xyz, params)
+    with local_engine() as engine:
+        done = TileBench(cloud, engine)
+        notes = done.apply("curvature_weighted", params).notes
+    found = states(done, len(points))
+    for detail, wanted in details_of(expected).items():
+        np.testing.assert_array_equal(found[detail], wanted)
+    np.testing.assert_array_equal(found["code"] == Reason.KEPT, expected.is_kept)
+    assert notes == expected.notes
+
+
+def test_a_tile_of_few_points_does_not_read_the_site(tmp_path, monkeypatch):
+    rng = np.random.default_rng(4)
+    ground = np.column_stack([rng.uniform(0, 60, (20_000, 2)), 0.01 * rng.normal(size=20_000)])
+    high = np.array([[20.0, 20.0, 14.0], [44.0, 40.0, 18.0], [30.0, 28.0, 15.0]])
+    points = np.vstack([ground, high])
+    cloud, whole = tiled(points, tmp_path, 4000, OctreeVoxelGrid(voxel_m=0.001))
+    read = {}
+    with_halo = nearest.with_halo
+
+    def counted(job, halo_m):
+        part = with_halo(job, halo_m)
+        read[part.own] = len(part.points)
+        return part
+
+    monkeypatch.setattr(nearest, "with_halo", counted)
+    params = FILTERS["statistical"].params()
+    with local_engine() as engine:
+        bench = TileBench(cloud, engine)
+        bench.apply("statistical", params)
+    assert min(read) <= 3
+    assert read[min(read)] < 5000
+    expected = FILTERS["statistical"].verb(whole.xyz, params)
+    found = states(bench, len(points))["code"] == Reason.KEPT
+    np.testing.assert_array_equal(found, expected.is_kept)
 
 
 RECIPE = [
