@@ -147,7 +147,7 @@ def test_what_it_says_and_refuses():
         low_outliers(points, LowOutliers(cell_m=0.1))
     ground = patch(np.random.default_rng(5), 30, (0, 20, 0, 20), 0.0)
     found = low_outliers(np.concatenate([ground, [[10.0, 10.0, -3.0]]]))
-    assert found.notes == ("1 of 12001 points lie below the ground",)
+    assert found.notes == ("1 of 12,001 points lie below the ground",)
     assert halo_m(LowOutliers(ground_window_m=12.0)) == 12.0
 
 

@@ -6,9 +6,9 @@ import laspy
 import numpy as np
 import pytest
 
-from dougong.cloud import Cloud
+from dougong.cloud import Cloud, Frame
 from dougong.errors import FormatError
-from dougong.formats import SUFFIXES, check, describe, iterate, read, write
+from dougong.formats import SUFFIXES, check, describe, faults_of, iterate, read, reissue, write
 
 CRS = "EPSG:32650"
 
@@ -109,6 +109,16 @@ def test_phantom_points_at_zero_are_found(tmp_path):
     assert any("20 points are exactly at 0, 0, 0" in text for text in found)
 
 
+def test_a_heap_of_phantoms_at_zero_does_not_shape_the_site(tmp_path):
+    points = hall() + [0, 0, 2300]
+    points[::20] = 0
+    cloud = Cloud.from_points(points)
+    assert "1,000 of 20,000 points lie far from all others." in faults_of(cloud)
+    found = texts(saved(tmp_path, points, ".ply", None), "warning")
+    assert any("1000 of 20000 points lie far from all others" in text for text in found)
+    assert not any("millimetres" in text for text in [*found, *faults_of(cloud)])
+
+
 def test_not_finite_rows_are_counted(tmp_path):
     path = saved(tmp_path, hall(), ".ply")
     raw = bytearray(path.read_bytes())
@@ -118,6 +128,22 @@ def test_not_finite_rows_are_counted(tmp_path):
     path.write_bytes(raw)
     (text,) = texts(path, "warning")
     assert "3 of 20000 rows had no finite coordinates" in text
+
+
+@pytest.mark.parametrize("box", [[np.nan] * 6, [1.0, 2.0, 9.0, 4.0, 6.0, 5.0]])
+def test_a_header_without_a_usable_box_is_said_and_harms_nothing(tmp_path, box):
+    path = saved(tmp_path, hall())
+    raw = bytearray(path.read_bytes())
+    struct.pack_into("<6d", raw, 179, *box)  # largest and smallest x, then y, then z
+    path.write_bytes(raw)
+    info = describe(path)
+    assert (info.extent_min, info.extent_max) == (None, None)
+    assert any("its header states no usable box" in note for note in info.notes)
+    (text,) = texts(path, "warning")
+    assert "its header states no usable box" in text
+    moved = tmp_path / "moved.las"
+    reissue(path, moved, [np.eye(4)], Frame())
+    assert describe(moved).extent_min == pytest.approx(hall().min(axis=0), abs=1e-6)
 
 
 def test_points_outside_the_box_of_the_header_are_said(tmp_path):
@@ -151,7 +177,7 @@ def test_unreadable_files_are_one_error_each(tmp_path):
 def test_findings_come_errors_first(tmp_path):
     points = np.array([[116.39, 39.9, 44.0]] * 3)
     severities = [finding.severity for finding in check(saved(tmp_path, points, crs="EPSG:4326"))]
-    assert severities == ["error", "warning", "warning"]  # degrees; copies, few points
+    assert severities == ["error", "error", "warning"]  # degrees, one place; few points
 
 
 def test_describe_tells_what_the_header_holds(tmp_path):
@@ -304,3 +330,26 @@ def test_check_doubts_millimetres_and_does_not_judge_three_points(tmp_path):
     said = " ".join(finding.text for finding in check(tmp_path / "three.laz"))
     assert "holds only 3 points" in said
     assert "multiple of" not in said
+
+
+def test_a_cloud_at_one_place_is_an_error(tmp_path):
+    path = saved(tmp_path, np.repeat([[500_000.0, 4_000_000.0, 50.0]], 5000, axis=0))
+    (text,) = texts(path, "error")
+    assert "all 5,000 points lie at one place (500000, 4000000, 50)" in text
+    assert not any("on another one" in text for text in texts(path, "warning"))
+
+
+def test_few_points_are_not_taken_for_degrees(tmp_path):
+    path = saved(tmp_path, [[0.0, 0.0, 0.0], [0.0, 0.01, 1.0], [0.001, 0.04, 2.0]], ".ply", None)
+    found = texts(path, "warning")
+    assert any("holds only 3 points" in text for text in found)
+    assert not any("degrees" in text for text in found)
+
+
+def test_colours_that_are_all_black_are_no_dark_colours(tmp_path):
+    header = laspy.LasHeader(point_format=2, version="1.2")
+    header.scales, header.offsets = [0.001] * 3, [500_000, 4_000_000, 0]
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = hall().T
+    las.write(tmp_path / "a.las")
+    assert any("no colours: all are 0" in text for text in texts(tmp_path / "a.las", "info"))

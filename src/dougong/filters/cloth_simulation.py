@@ -168,7 +168,7 @@ def cloth_notes(low: int, lost: int, points: int) -> tuple[str, ...]:
     """Return what is to be said where of all `points` so many are low, and without a height."""
     notes = low_notes(low, points)
     if lost:
-        notes += (f"{lost} of {points} points are too far from any ground for a height",)
+        notes += (f"{lost:,} of {points:,} points are too far from any ground for a height",)
     return notes
 
 

@@ -1,4 +1,4 @@
-"""The extent of a cloud without its isolated far points."""
+"""The extent of a cloud without its isolated far points and heaps."""
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, label
@@ -18,7 +18,8 @@ def plan_box(points: Points) -> tuple[Values, Values, float]:
 
     The box is cut into 64 x 64 bins, and bins less than a quarter of the box apart are one group.
     A group of at most 1 in 10,000 points (or 16, or 1 in 100, whichever of these two is less) is
-    far; the box shrinks to the others, and again until nothing is far.
+    far, and so is any number at one single place, as scanners write missing returns; the box
+    shrinks to the others, and again until nothing is far.
     points (n >= 1, 3), metres; low, high (2,): x and y; lowest: the smallest z inside.
     """
     return plan_box_of(lambda: (points,), len(points))
@@ -62,9 +63,21 @@ def _without_far_bins(
     few = max(_FEW_SHARE * points, min(_FEW_POINTS, _FEW_SHARE_OF_SMALL * points))
     is_kept = total > few
     is_kept[0] = False
-    if is_kept[1:].all():
+    for group in np.flatnonzero(is_kept):
+        rows, columns = np.nonzero(groups == group)
+        if len(rows) == 1:
+            corner = low + size * np.array([columns[0], rows[0]])
+            is_kept[group] = not _is_heap(blocks, corner, size)
+    if is_kept[1:].all() or not is_kept.any():
         return None
     rows, columns = np.nonzero(is_kept[groups])
     cut_low = low + size * np.array([columns.min(), rows.min()])
     cut_high = low + size * np.array([columns.max() + 1, rows.max() + 1])
     return np.maximum(low, cut_low), np.minimum(high, cut_high)
+
+
+def _is_heap(blocks: Blocks, corner: Values, size: float) -> bool:
+    """Say whether all points in a bin that stands alone lie at one place in plan."""
+    # Half a bin more on all sides: the border of a bin is rounded, and nothing else is near.
+    x_low, y_low, x_high, y_high, _ = _bounds(blocks, corner - size / 2, corner + 1.5 * size)
+    return bool(x_low == x_high and y_low == y_high)

@@ -127,7 +127,7 @@ def low_outliers(points: Points, params: LowOutliers | None = None) -> Selection
 
 def low_notes(low: int, points: int) -> tuple[str, ...]:
     """Return what is to be said where `low` of all `points` are low outliers."""
-    return (f"{low} of {points} points lie below the ground",) if low else ()
+    return (f"{low:,} of {points:,} points lie below the ground",) if low else ()
 
 
 def find_levels(blocks: Blocks, points: int, params: LowOutliers) -> Levels:

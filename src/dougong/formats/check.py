@@ -17,9 +17,11 @@ from dougong.cloud import Cloud, Frame
 from dougong.errors import FormatError
 from dougong.formats.describe import describe
 from dougong.formats.faults import (
+    FEW,
     SAMPLE,
     coordinate_hashes,
     copies_among,
+    counted,
     robust_box,
     unit_suspicion,
 )
@@ -31,8 +33,6 @@ from dougong.formats.units import metric_problem
 from dougong.typing import Points
 
 _CHUNK = 1_000_000
-_FEW = 100
-"""Fewer points prove nothing about how they were stored."""
 COARSE_M = 0.01
 """Coordinate steps from here on hide the detail of a building."""
 
@@ -138,7 +138,7 @@ def _of_step(info: FileInfo, tally: _Tally) -> list[Finding]:
     for axis in range(3):
         step_m = info.scale[axis] * info.unit_m[axis]
         used = tally.common_step[axis]
-        if used * step_m >= COARSE_M * (1 - 1e-9) and used > 1 and tally.rows >= _FEW:
+        if used * step_m >= COARSE_M * (1 - 1e-9) and used > 1 and tally.rows >= FEW:
             text = (
                 f"{name}: every {'xyz'[axis]} is a multiple of {used * step_m:.3g} m, coarser than "
                 "the file's own step; detail was lost before this file was written."
@@ -152,7 +152,9 @@ def _of_step(info: FileInfo, tally: _Tally) -> list[Finding]:
             "Export it with a scale of 0.001 m or finer."
         )
         found.append(Finding("warning", text))
-    if 0 <= tally.colour_max <= 255:
+    if tally.colour_max == 0:
+        found.append(Finding("info", f"{name} has room for colours but no colours: all are 0."))
+    elif 0 < tally.colour_max <= 255:
         text = f"{name} has colours in 0..{tally.colour_max} where LAS has 0..65535: it looks dark."
         found.append(Finding("info", text))
     return found
@@ -183,7 +185,14 @@ def _of_points(path: Path, info: FileInfo, tally: _Tally) -> list[Finding]:
         for note in dict.fromkeys(tally.notes)
     ]
     copies = copies_among(np.concatenate(tally.hashes))
-    if copies:
+    if 0 < copies == tally.rows - 1:
+        place = ", ".join(f"{value:.10g}" for value in tally.frame.to_file(tally.low[None])[0])
+        text = (
+            f"{path.name}: all {tally.rows:,} points lie at one place ({place}), so it shows "
+            "nothing. Export it again."
+        )
+        found.append(Finding("error", text))
+    elif copies:
         text = (
             f"{path.name}: {copies} of {tally.rows} points lie exactly on another one. "
             "The voxel grid keeps one of each."
@@ -191,13 +200,11 @@ def _of_points(path: Path, info: FileInfo, tally: _Tally) -> list[Finding]:
         found.append(Finding("warning", text))
     origin = tally.frame.origin
     sample = np.concatenate(tally.samples)
-    suspicion = unit_suspicion(sample, tally.frame)
-    if suspicion:
-        found.append(Finding("warning", f"{path.name}: {suspicion}"))
-    if tally.rows < _FEW:
-        points = "1 point" if tally.rows == 1 else f"{tally.rows} points"
-        text = f"{path.name} holds only {points}: too few to filter or register."
+    if tally.rows < FEW:
+        text = f"{path.name} holds only {counted(tally.rows)}: too few to filter or register."
         found.append(Finding("warning", text))
+    elif suspicion := unit_suspicion(sample, tally.frame):
+        found.append(Finding("warning", f"{path.name}: {suspicion}"))
     low, high = robust_box(sample)
     is_inside_origin = bool(((-origin >= low) & (-origin <= high)).all())
     if tally.at_origin and (tally.at_origin > 1 or not is_inside_origin):
@@ -219,6 +226,6 @@ def _far_points(path: Path, info: FileInfo, tally: _Tally, low: Any, high: Any) 
         farthest = max(farthest, float(beyond.max()))
     text = (
         f"{path.name}: {count} of {info.points} points lie far from all others, up to "
-        f"{farthest:.3g} m. Filters drop them; crop them before other use."
+        f"{farthest:,.0f} m. Filters drop most of them; crop them before other use."
     )
     return [Finding("warning", text)]

@@ -11,6 +11,8 @@ from dougong._boxes import are_within
 from dougong.cloud import Cloud, Frame
 from dougong.typing import Points
 
+FEW = 100
+"""Fewer points prove nothing about how they were stored, and hold no site."""
 SAMPLE = 200_000
 """Points that shape the robust box."""
 NO_SYSTEM = "no coordinate reference system is named; its numbers are taken as metres."
@@ -49,9 +51,19 @@ def copies_in(xyz: Points) -> int:
     return copies_among(coordinate_hashes(xyz))
 
 
+def _places(sample: Points) -> Points:
+    """Return each place of a sample once.
+
+    Missing returns that a scanner wrote at 0, 0, 0 are a heap that would pass for a part of the
+    site.
+    """
+    _, first = np.unique(coordinate_hashes(sample), return_index=True)
+    return sample if len(first) == len(sample) else sample[first]
+
+
 def robust_box(sample: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the box of the middle 98 % grown on all sides by ten times its longest edge."""
-    low, high = np.quantile(sample, [0.01, 0.99], axis=0)
+    low, high = np.quantile(_places(sample), [0.01, 0.99], axis=0)
     margin = max(_FAR_LEAST_M, _FAR_FACTOR * float((high - low).max()))
     return low - margin, high + margin
 
@@ -68,7 +80,7 @@ def unit_suspicion(sample: Points, frame: Frame) -> str | None:
     """
     if frame.crs is not None:
         return None
-    low, high = np.quantile(sample, [0.01, 0.99], axis=0)
+    low, high = np.quantile(_places(sample), [0.01, 0.99], axis=0)
     span = high - low
     first, last = frame.to_file(np.stack([low, high]))
     middle = (first + last) / 2
@@ -128,12 +140,21 @@ def faults_in_words(
     found = []
     if frame.crs is None:
         found.append(NO_SYSTEM)
-    if copies:
+    if 0 < copies == points - 1:
+        found.append(f"all {points:,} points lie at one place.")
+    elif copies:
         found.append(f"{copies:,} of {points:,} points lie exactly on another one.")
     if far:
         found.append(f"{far:,} of {points:,} points lie far from all others.")
+    if points < FEW:
+        return (*found, f"only {counted(points)}: too few to filter or register.")
     suspicion = unit_suspicion(sample, frame)
     return (*found, suspicion) if suspicion else tuple(found)
+
+
+def counted(points: int) -> str:
+    """Return a number of points in words."""
+    return "1 point" if points == 1 else f"{points:,} points"
 
 
 def points_beyond(xyz: Points, low: Any, high: Any) -> int:

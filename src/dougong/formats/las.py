@@ -166,6 +166,12 @@ def _notes(header: LasHeader, frame: Frame, path: Path) -> tuple[str, ...]:
     has_record = any(vlr.key[0] == PROJECTION for vlr in (*header.vlrs, *header.evlrs))
     if frame.crs is None and has_record:
         found.append("the reference system it names could not be understood.")
+    if header.count and not header.has_box:
+        (x, y, z), (x_high, y_high, z_high) = header.extent
+        found.append(
+            f"its header states no usable box (x {x:g} to {x_high:g}, y {y:g} to {y_high:g}, z "
+            f"{z:g} to {z_high:g}), wrongly; the points themselves count."
+        )
     return tuple(found)
 
 
@@ -203,8 +209,8 @@ def describe(path: Path) -> FileInfo:
         points=header.count,
         bytes=path.stat().st_size,
         is_compressed=header.is_compressed,
-        extent_min=as_triple(header.extent[0]) if header.count else None,
-        extent_max=as_triple(header.extent[1]) if header.count else None,
+        extent_min=as_triple(header.extent[0]) if header.count and header.has_box else None,
+        extent_max=as_triple(header.extent[1]) if header.count and header.has_box else None,
         crs_wkt=frame.crs,
         crs_name=units.name or None,
         unit_names=units.names,

@@ -184,6 +184,12 @@ class LasHeader:
         return high_low[:, ::-1].T.copy()
 
     @cached_property
+    def has_box(self) -> bool:
+        """True where `extent` can be the box of points at all, right or wrong."""
+        low, high = self.extent
+        return bool(np.isfinite(self.extent).all() and (low <= high).all())
+
+    @cached_property
     def evlr_place(self) -> tuple[int, int]:
         """File position of the first extended record, and how many there are."""
         if self.minor < 4:

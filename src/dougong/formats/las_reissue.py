@@ -61,7 +61,8 @@ def reissue_las(
     refuse_bad_target(output, overwrite=overwrite, source=source)
     job = _Job(chunks, source, output, matrices, target)
     whole = matrices[0]
-    if header is not None and whole is not None and header.point_format not in _WAVEFORM_FORMATS:
+    is_plain = header is not None and header.point_format not in _WAVEFORM_FORMATS
+    if header is not None and whole is not None and is_plain and header.has_box:
         # Offsets follow from where the header says the points lie: one that lies about it matters
         # only where they do not fit.
         try:
