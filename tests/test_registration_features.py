@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from dougong import threads
 from dougong.errors import InputError
-from dougong.registration.features import fpfh, mutual_matches, nearest_features
+from dougong.registration.features import fpfh, nearest_features
 from reference import features as twin
 
 
@@ -75,18 +75,8 @@ def test_search_with_fewer_candidates_than_asked_for():
     places, distance = nearest_features(np.zeros((2, 3)), np.ones((1, 3)), 3)
     np.testing.assert_array_equal(places, [[0, -1, -1]] * 2)
     assert np.isinf(distance[:, 1:]).all()
-    assert not len(mutual_matches(np.zeros((2, 3)), np.zeros((0, 3))).source)
     with pytest.raises(InputError, match="k must be at least 1"):
         nearest_features(np.zeros((2, 3)), np.ones((1, 3)), 0)
-
-
-def test_mutual_matches_find_a_shuffled_copy():
-    features = np.random.default_rng(7).random((200, 33))
-    order = np.random.default_rng(8).permutation(200)
-    found = mutual_matches(features, features[order])
-    np.testing.assert_array_equal(found.source, np.arange(200))
-    np.testing.assert_array_equal(order[found.target], found.source)
-    np.testing.assert_array_equal(found.distance, 0.0)
 
 
 def test_normals_of_another_shape_are_refused():

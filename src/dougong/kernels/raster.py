@@ -12,8 +12,6 @@ from dougong.kernels._jit import kernel
 
 MICRON = 1e-6
 """Plan coordinates and heights are rounded to this (metres) before they meet a cell or a tie."""
-UNCOUNTED = -1
-"""Cell number of a point outside the grid."""
 
 
 @kernel
@@ -79,26 +77,6 @@ def lowest_heights(points: Floats, origin: Floats, cell: float, out: Floats) -> 
 
 
 @kernel
-def cell_indices(
-    points: Floats, origin: Floats, cell: float, shape: tuple[int, int], ix: Ints, iy: Ints
-) -> None:
-    """Fill the column `ix` and row `iy` of each point; both UNCOUNTED (-1) outside the grid.
-
-    points (n, 3) (or (n, 2)); origin (2,) or longer: the low corner of cell (0, 0); a cell covers
-    [low, low + cell) after rounding to a micrometre. shape (rows, columns). ix, iy (n,).
-    """
-    rows, columns = shape
-    for i in range(points.shape[0]):
-        column = int(np.floor(rounded(points[i, 0], origin[0]) / cell))
-        row = int(np.floor(rounded(points[i, 1], origin[1]) / cell))
-        if column < 0 or row < 0 or column >= columns or row >= rows:
-            column = UNCOUNTED
-            row = UNCOUNTED
-        ix[i] = column
-        iy[i] = row
-
-
-@kernel
 def cell_max(ix: Ints, iy: Ints, values: Floats, shape: tuple[int, int], out: Floats) -> None:
     """Raise out[iy, ix] to the largest value of the cell.
 
@@ -122,18 +100,6 @@ def cell_min(ix: Ints, iy: Ints, values: Floats, shape: tuple[int, int], out: Fl
         if 0 <= ix[i] < shape[1] and 0 <= iy[i] < shape[0] and values[i] == values[i]:
             if not out[iy[i], ix[i]] <= values[i]:
                 out[iy[i], ix[i]] = values[i]
-
-
-@kernel
-def cell_count(ix: Ints, iy: Ints, shape: tuple[int, int], out: Ints) -> None:
-    """Add the number of points of each cell to out[iy, ix].
-
-    ix, iy (n,); points outside `shape` (rows, columns) are skipped.
-    out (rows, columns): start it with 0; a second call continues a stream.
-    """
-    for i in range(ix.shape[0]):
-        if 0 <= ix[i] < shape[1] and 0 <= iy[i] < shape[0]:
-            out[iy[i], ix[i]] += 1
 
 
 @kernel

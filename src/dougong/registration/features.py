@@ -1,6 +1,5 @@
 """Points that describe their surroundings: FPFH (Rusu 2009) and the matching of features."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -105,28 +104,3 @@ def nearest_features(queries: Points, features: Points, k: int) -> tuple[Index, 
 
     for_blocks(len(asked), _BLOCK, task)
     return places, np.sqrt(distance2)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Matches:
-    """Points of two clouds whose features are alike."""
-
-    source: Index
-    """(k,)"""
-    target: Index
-    """(k,)"""
-    distance: Values
-    """(k,) between the features."""
-
-
-def mutual_matches(source: Points, target: Points) -> Matches:
-    """Return the pairs that are each other's nearest among features (n, d) and (m, d)."""
-    to_target, distance = nearest_features(source, target, 1)
-    to_source, _ = nearest_features(target, source, 1)
-    rows = np.arange(len(source), dtype=np.int64)
-    if not len(target):
-        return Matches(source=rows[:0], target=rows[:0], distance=distance[:0, 0])
-    is_mutual = to_source[to_target[:, 0], 0] == rows
-    return Matches(
-        source=rows[is_mutual], target=to_target[is_mutual, 0], distance=distance[is_mutual, 0]
-    )
