@@ -216,6 +216,13 @@ def test_unexpected_errors_are_one_line_unless_debugged(room, capsys, monkeypatc
     assert "Traceback" in capsys.readouterr().err
 
 
+def test_commands_are_listed_in_the_order_of_a_survey(capsys):
+    assert call(["--help"]) == 0
+    said = capsys.readouterr().out
+    at = [said.index(f"\u2502 {command} ") for command in COMMANDS]
+    assert at == sorted(at)
+
+
 def test_tables_set_figures_flush_right():
     text = table([["a", "1"], ["bb", "1,000"]], ["name", "points"])
     assert text.splitlines() == ["  name  points", "  a          1", "  bb     1,000"]
@@ -280,7 +287,7 @@ def test_a_matrix_file_that_is_none_is_one_sentence(room, text, said, capsys):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('[[cloud]]\nname="a"\nkind="lidar"\nfiles="a.laz"\n', "cloud.0.files.*expected a list"),
+        ('[[cloud]]\nname="a"\nkind="lidar"\nfiles="a.laz"\n', "number 1, files.*expected a list"),
         ('[[cloud]]\nname="a"\nkind="lidar"\nfiles=["a"]\n' * 2, r"cloud: two clouds are called"),
         ('[project]\nreference="b"\n[[cloud]]\nname="a"\nkind="lidar"\nfiles=["a"]\n',
          r"p\.toml: project\.reference names 'b', which is no cloud"),

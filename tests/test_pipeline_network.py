@@ -133,6 +133,26 @@ def test_what_no_link_reaches_is_named_and_left_out(network):
     assert set(result["merged"]["clouds"]) == set("abcd")
 
 
+def test_a_cloud_that_cannot_be_registered_does_not_stop_the_others(network):
+    def holds(one, other):
+        if "e" in (one, other):
+            raise dougong.RegistrationError("e has too few usable points (3).")
+        return True
+
+    result = network(holds)
+    assert result["network"]["unreached"] == ["e"]
+    assert result["registrations"][-1]["reason"] == "e has too few usable points (3)."
+    assert set(result["merged"]["clouds"]) == set("abcd")
+
+
+def test_a_reference_that_cannot_be_registered_onto_is_an_error(network):
+    def holds(one, other):
+        raise dougong.RegistrationError(f"{other} is not levelled.")
+
+    with pytest.raises(dougong.RegistrationError, match="a is not levelled"):
+        network(holds)
+
+
 def test_a_wrong_link_is_named_and_left_out(network):
     result = network(lambda *_: True, wrong=[("c", "b")])
     left_out = [(r["source"], r["target"]) for r in result["network"]["links"] if r["is_left_out"]]

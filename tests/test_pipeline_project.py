@@ -3,12 +3,14 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from dougong.errors import InputError
-from dougong.formats import FileInfo
-from dougong.pipeline.guess import Guess, guess_kind, project_text
-from dougong.pipeline.project import Entry, files_of, from_files, read_project
+from dougong.cloud import Cloud
+from dougong.errors import FormatError, InputError
+from dougong.formats import FileInfo, write
+from dougong.pipeline.guess import Guess, find_clouds, guess_kind, project_text
+from dougong.pipeline.project import Entry, Project, all_files, files_of, from_files, read_project
 
 DOCS = Path(__file__).parents[1] / "docs" / "commands.md"
 GOOD = """
@@ -58,13 +60,17 @@ def test_a_cloud_without_a_unit_is_no_reference(project):
     ("text", "said"),
     [
         ("", "'cloud' is missing"),
-        ("[[cloud]]\nname='a'", r"'cloud\.0\.kind' is missing"),
-        (GOOD + "colour = 1", r"unknown name 'cloud\.1\.colour'"),
-        (GOOD.replace("photogrammetry", "drone"), r"cloud\.1\.kind, got 'drone': .*'lidar' or"),
+        ("[[cloud]]\nname='a'", r"'\[\[cloud\]\] number 1, kind' is missing"),
+        (GOOD + "colour = 1", r"unknown name '\[\[cloud\]\] number 2, colour'"),
+        (
+            GOOD.replace("photogrammetry", "drone"),
+            r"number 2, kind, got 'drone': .*'lidar' or 'photogrammetry'\.$",
+        ),
         (GOOD.replace('"drone"', '"scan"'), "two clouds are called 'scan'"),
         ('[project]\nreference = "dron"' + GOOD, "names 'dron'.*did you mean 'drone'"),
         (GOOD + "[registr]\ncoarse='auto'", "'registr', did you mean 'register'"),
         (GOOD + "[register]\ndof=3", r"register\.dof"),
+        (GOOD + "hue = 1\n[register]\ndof=3", r"Also wrong: register\.dof\.$"),
         (GOOD + "[filter.lidar.octree_voxel_grid]\nvoxel=1", "did you mean 'voxel_m'"),
         (GOOD + "[register]\ndof=7", "every cloud's scale is known"),
         (GOOD.replace("kind", "scale_known = false\nkind"), "every cloud has scale_known = false"),
@@ -101,6 +107,30 @@ def test_patterns_are_relative_sorted_and_name_each_file_once(tmp_path):
         files_of(Entry(name="s", kind="lidar", files=("scan/*.laz",)), tmp_path)
 
 
+def test_one_file_under_two_names_is_refused(tmp_path):
+    (tmp_path / "a.laz").write_bytes(b"LASF")
+    (tmp_path / "b.laz").symlink_to("a.laz")
+    twice = [{"name": n, "kind": "lidar", "files": [f"{n}.laz"]} for n in "ab"]
+    pattern = [{"name": "a", "kind": "lidar", "files": ["*.laz"]}]
+    for entries in (twice, pattern):
+        with pytest.raises(InputError, match=r"a.laz and .*b.laz are one file, named twice"):
+            all_files(Project.model_validate({"cloud": entries}), tmp_path)
+
+
+def test_what_is_no_cloud_is_said_before_any_work(tmp_path):
+    (tmp_path / "a.laz").write_bytes(b"LASF")
+    (tmp_path / "site.jpg").write_bytes(b"no cloud")
+    (tmp_path / "scans").mkdir()
+    clouds = [{"name": n, "kind": "lidar", "files": [n]} for n in ("a.laz", "site.jpg")]
+    with pytest.raises(FormatError, match=r"site.jpg has the suffix '.jpg'"):
+        all_files(Project.model_validate({"cloud": clouds}), tmp_path)
+    for text in ("scans", str(tmp_path / "scans")):
+        with pytest.raises(InputError, match=r"scans is a folder. Name the files in it, or .*\*"):
+            files_of(Entry(name="s", kind="lidar", files=(text,)), tmp_path)
+    with pytest.raises(InputError, match=r"point cloud by its name.* --lidar a.laz or --photo"):
+        read_project(tmp_path / "a.laz")
+
+
 def test_a_file_name_with_brackets_is_found_as_it_is(tmp_path):
     (tmp_path / "hall [1].laz").touch()
     entry = Entry(name="s", kind="lidar", files=("hall [1].laz",))
@@ -108,8 +138,10 @@ def test_a_file_name_with_brackets_is_found_as_it_is(tmp_path):
 
 
 def test_two_clouds_of_one_stem_are_refused():
-    with pytest.raises(InputError, match="two clouds are called 'a'"):
+    with pytest.raises(InputError, match=r"a.laz and b/a.e57 would both be the cloud 'a'.*Rename"):
         from_files([Path("a.laz"), Path("b/a.e57")], [])
+    with pytest.raises(InputError, match=r"a.laz is named twice"):
+        from_files([Path("a.laz")], [Path("b/../a.laz")])
     with pytest.raises(InputError, match="no cloud is named"):
         from_files([], [])
 
@@ -139,14 +171,28 @@ def test_sensors_are_guessed_from_what_files_hold(found, kind):
     assert why
 
 
+def test_earlier_results_and_hidden_files_are_no_clouds_of_a_survey(tmp_path):
+    for place in ("", "out/clouds/", ".out.part-1/clouds/", "pose/"):
+        (tmp_path / place).mkdir(parents=True, exist_ok=True)
+        write(Cloud.from_points(np.eye(3)), tmp_path / place / "scan.laz")
+    for file in ("out/result.json", "pose/registration.json", "pose/report.html"):
+        (tmp_path / file).touch()
+    guesses, skipped = find_clouds(tmp_path)
+    assert [guess.file for guess in guesses] == [Path("scan.laz")]
+    assert skipped == ["out: a result of dougong", "pose: a result of dougong"]
+
+
+NAMES = ['an "odd" name', "祈年殿", "two\nlines\x7f"]
+
+
 def test_the_written_project_reads_back_whatever_the_names(project):
     guesses = [
         Guess(
             name=name, file=Path(name + ".laz"), kind="lidar", why="no colour", stations=3, points=5
         )
-        for name in ('an "odd" name', "祈年殿")
+        for name in NAMES
     ]
-    found = read_project(project(project_text('A "site"', guesses, ["b.laz: it is empty"])))
-    assert [entry.name for entry in found.cloud] == ['an "odd" name', "祈年殿"]
+    found = read_project(project(project_text('A "site"', guesses, ["b\n.laz: it is empty"])))
+    assert [entry.name for entry in found.cloud] == NAMES
     assert found.cloud[0].files == ('an "odd" name.laz',)
     assert found.project.name == 'A "site"'

@@ -232,6 +232,33 @@ def test_the_result_hash_forgets_time_paths_and_point_order(folder, capsys):
     assert third["result_hash"] != first["result_hash"]
 
 
+def test_a_copy_of_a_file_is_said(folder, capsys, monkeypatch):
+    monkeypatch.setattr("dougong.pipeline.links.register", answer("ok"))
+    (folder / "two.laz").write_bytes((folder / "one.laz").read_bytes())
+    code, result = run(capsys, clouds(folder), "--out", folder / "out")
+    assert code == 0
+    assert any("two.laz is a copy of one.laz" in note for note in result["notes"])
+
+
+def test_registering_a_file_onto_its_copy_is_said(folder, capsys, monkeypatch):
+    monkeypatch.setattr("dougong.pipeline.registering_files.register", answer("ambiguous"))
+    (folder / "two.laz").write_bytes((folder / "one.laz").read_bytes())
+    for target, said in (("two.laz", True), ("map.laz", False)):
+        tokens = ["register", "one.laz", target, "--out", "pose", "--filtered", "--overwrite"]
+        monkeypatch.chdir(folder)
+        assert call([*tokens, "--json", "--quiet"]) == 3
+        notes = json.loads(capsys.readouterr().out)["notes"]
+        assert any("the same file, or copies of one" in note for note in notes) is said
+
+
+def test_a_file_that_cannot_be_read_leaves_no_empty_folder(folder, capsys):
+    damaged = (folder / "one.laz").read_bytes()[:3000]
+    (folder / "one.laz").write_bytes(damaged)
+    before = sorted(folder.iterdir())
+    assert run(capsys, "--lidar", folder / "one.laz", "--out", folder / "out")[0] == 1
+    assert sorted(folder.iterdir()) == before
+
+
 def test_a_failing_job_leaves_nothing(folder, capsys, monkeypatch):
     def broken(*args, **kwargs):
         raise dougong.RegistrationError("no overlap at all.")
@@ -249,7 +276,7 @@ def test_a_failing_job_leaves_nothing(folder, capsys, monkeypatch):
         (("--lidar", "gone.laz"), "there is no file"),
         ((), "no cloud is named"),
         (("project.toml", "--lidar", "one.laz"), "Pass one or the other"),
-        (("--lidar", "one.laz", "--photogrammetry", "one.laz"), "two clouds are called 'one'"),
+        (("--lidar", "one.laz", "--photogrammetry", "one.laz"), "one.laz is named twice"),
         (("--lidar", "one.laz", "--memory", "200MB"), "more than --memory"),
     ],
 )

@@ -263,14 +263,14 @@ def run_project(
     """
     from dougong.pipeline.memory import Room
     from dougong.pipeline.outputs import refuse_existing, result_folder
-    from dougong.pipeline.project import asked_project, files_of
+    from dougong.pipeline.project import all_files, asked_project
     from dougong.pipeline.refusals import refuse_full_disk, refuse_or_announce
     from dougong.pipeline.run import run
 
     out = _named(out)
     refuse_existing([out / "result.json"], overwrite)
     asked, folder = asked_project(project, lidar, photogrammetry, full_resolution, merge)
-    files = [file for entry in asked.cloud for file in files_of(entry, folder)]
+    files = all_files(asked, folder)
     if asked.project.full_resolution:
         refuse_full_disk(files, out)
     _say_if_cold(progress)
@@ -295,9 +295,10 @@ def plan(
     """Return what `run_project` would do: ways, memory, disk, time (see `pipeline.plan.Plan`)."""
     from dougong.pipeline.memory import Room
     from dougong.pipeline.plan import plan_run
-    from dougong.pipeline.project import asked_project
+    from dougong.pipeline.project import all_files, asked_project
 
     asked, folder = asked_project(project, lidar, photogrammetry, full_resolution)
+    all_files(asked, folder)
     progress.stage("counting points")
     return plan_run(asked, folder, Room.of(memory_bytes)).document()
 

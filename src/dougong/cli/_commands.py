@@ -51,7 +51,8 @@ def unwrapped(text: str) -> str:
     return "\n".join(lines)
 
 
-for _command in (
+# In the order of a survey, which --help keeps.
+_COMMANDS = (
     demo,
     run,
     plan,
@@ -65,9 +66,11 @@ for _command in (
     view,
     evaluate,
     bench,
-):
+)
+for _place, _command in enumerate(_COMMANDS):
     _command.command.__doc__ = unwrapped(_command.command.__doc__ or "")
-    app.command(_command.command, name=_command.__name__.rsplit(".", 1)[1])
+    _name = _command.__name__.rsplit(".", 1)[1]
+    app.command(_command.command, name=_name, sort_key=_place)
 
 
 _FLAGS = frozenset({"--quiet", "--json", "--debug"})

@@ -28,6 +28,11 @@ def percent(share: float) -> str:
     return f"{100 * share:.2f} %"
 
 
+def sentence(text: str) -> str:
+    """Return a text with a capital, as it follows a full stop."""
+    return text[:1].upper() + text[1:]
+
+
 def millimetres(metres: float | None) -> str:
     """Return metres as millimetres in words."""
     return "unknown" if metres is None else f"{1000 * metres:.1f} mm"
@@ -69,7 +74,8 @@ def stages(document: Sequence[Mapping[str, Any]]) -> str:
 def registration(document: Mapping[str, Any]) -> str:
     """Return one registration in a few lines."""
     status = _MARKS[document["status"]]
-    lines = [f"{document['source']} -> {document['target']}: {status}. {document['reason']}"]
+    reason = sentence(document["reason"])
+    lines = [f"{document['source']} -> {document['target']}: {status}. {reason}"]
     fine = document["fine"]
     if fine:
         lines.append(

@@ -14,7 +14,7 @@ def command(
     *,
     out: Path = Path("dougong-bench"),
     only: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = (),
-    points: Annotated[tuple[float, ...], Parameter(negative="")] = (1e5, 1e6),
+    points: Annotated[tuple[float, ...], Parameter(negative="", show_default=False)] = (1e5, 1e6),
     repeats: int = 3,
     overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     common: Common = DEFAULT,
@@ -31,9 +31,10 @@ def command(
     out
         Folder for bench.json; what it holds already, of this code and machine, is kept.
     only
-        Measure this operation; may be given several times. Default: all.
+        Measure this operation: voxel, knn, radius, normals, sor, ror, curvature, cwasf, csf,
+        csf-outliers or icp; may be given several times. Default: all.
     points
-        Size of the generated clouds; may be given several times.
+        Size of the generated clouds; may be given several times. Default: 1e5 and 1e6.
     repeats
         How often everyone is asked, in turn; seconds are medians.
     overwrite

@@ -1,5 +1,6 @@
 """``dougong init``: which clouds are here, which sensor made each, and a project file for them."""
 
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +48,9 @@ def guess_kind(info: FileInfo) -> tuple[Kind, str]:
 
 
 def find_clouds(folder: Path) -> tuple[list[Guess], list[str]]:
-    """Return the clouds in `folder` (and below), and what could not be read.
+    """Return the clouds in `folder` (and below), and what was left out and why.
+
+    Earlier results of ours and hidden folders are left out: their clouds are no survey.
 
     Raises
     ------
@@ -57,11 +60,17 @@ def find_clouds(folder: Path) -> tuple[list[Guess], list[str]]:
     if not folder.is_dir():
         msg = f"{folder} is no folder. Name the folder that holds the clouds."
         raise InputError(msg)
+    results = _results_in(folder)
+    skipped = [f"{result.relative_to(folder)}: a result of dougong" for result in results]
     files = sorted(
-        path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in SUFFIXES
+        and path.is_file()
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        and not any(result in path.parents for result in results)
     )
     guesses: list[Guess] = []
-    skipped: list[str] = []
     for file in files:
         try:
             info = describe(file)
@@ -86,6 +95,19 @@ def find_clouds(folder: Path) -> tuple[list[Guess], list[str]]:
     return guesses, skipped
 
 
+def _results_in(folder: Path) -> list[Path]:
+    """Return the folders below `folder` that a run, a demo or a registration wrote."""
+    known = {"result.json": "clouds", "registration.json": "report.html"}
+    return sorted(
+        {
+            path.parent
+            for name, other in known.items()
+            for path in folder.rglob(name)
+            if path.parent != folder and (path.parent / other).exists()
+        }
+    )
+
+
 def _free_name(name: str, taken: Iterable[str]) -> str:
     used, number, free = set(taken), 2, name
     while free in used:
@@ -94,7 +116,8 @@ def _free_name(name: str, taken: Iterable[str]) -> str:
 
 
 def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    # A TOML string escapes what a JSON string does, and the delete character besides.
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def project_text(title: str, guesses: list[Guess], skipped: list[str]) -> str:
@@ -123,7 +146,7 @@ def project_text(title: str, guesses: list[Guess], skipped: list[str]) -> str:
                 "registered = true   # false: each of the "
                 f"{guess.stations} stations is registered by itself"
             )
-    lines += [f"# skipped {text}" for text in skipped]
+    lines += [f"# skipped {' '.join(text.split())}" for text in skipped]
     return "\n".join([*lines, *_SETTINGS]) + "\n"
 
 

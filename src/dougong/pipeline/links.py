@@ -78,7 +78,7 @@ def register_pair(
         scale=source.scale,
         is_declared=True,
     )
-    progress.note(f"{source.name} -> {target.name}: {result.status}. {result.reason}")
+    progress.note(f"{source.name} -> {target.name} is {result.status}: {result.reason}")
     return result
 
 

@@ -92,8 +92,12 @@ class Loader:
             found = self._on_tiles(entry, file, digest)
         else:
             found = self._whole(entry, file, digest)
+        twin = next((other for other, of in self.inputs.items() if of["sha256"] == digest), None)
         self.inputs[file] = {"path": self.shown(file), "sha256": digest, "points": 0}
         for source in found:
+            if twin is not None:
+                said = f"{file.name} is a copy of {twin.name}: its points are in the result twice"
+                source = replace(source, notes=(*source.notes, said))
             self.inputs[file]["points"] += source.points_in
             self.waiting += source.kept.points if source.kept.is_held else 0
             yield source

@@ -20,6 +20,7 @@ import numpy as np
 
 from dougong._sorting import distinct
 from dougong.cloud import Cloud, Frame
+from dougong.errors import RegistrationError
 from dougong.pipeline.links import Linked, register_pair
 from dougong.pipeline.movers import Mover, ReducedClouds
 from dougong.pipeline.progress import Progress
@@ -62,25 +63,55 @@ class _Search:
     progress: Progress
     clouds: ReducedClouds
     tried: dict[tuple[str, str], Registration] = field(default_factory=dict)
+    errors: list[RegistrationError] = field(default_factory=list)
+    """Why searches could not start."""
 
     def cloud(self, name: str) -> Cloud:
         """Return the reduced cloud of a mover."""
         return self.clouds.of(name).cloud
 
     def registered(self, source: str, target: str) -> Registration:
-        """Register a pair, once."""
+        """Register a pair, once.
+
+        Raises
+        ------
+        RegistrationError
+            There are two clouds, and no pose can even be looked for.
+        """
         known = self.tried.get((source, target))
         if known is None:
-            known = register_pair(
-                self.movers[source],
-                self.movers[target],
-                (self.cloud(source), self.cloud(target)),
-                self.params,
-                self.control if target == self.reference else {},
-                self.progress,
-            )
+            try:
+                known = register_pair(
+                    self.movers[source],
+                    self.movers[target],
+                    (self.cloud(source), self.cloud(target)),
+                    self.params,
+                    self.control if target == self.reference else {},
+                    self.progress,
+                )
+            except RegistrationError as error:
+                if len(self.movers) == 2:
+                    raise
+                self.progress.note(f"{source} -> {target} is failed: {error}")
+                known = self._impossible(error)
             self.tried[source, target] = known
         return known
+
+    def _impossible(self, error: RegistrationError) -> Registration:
+        """Return the answer for a pair whose search cannot start: one of many, so others go on."""
+        self.errors.append(error)
+        return Registration(
+            status="failed",
+            matrix=None,
+            reason=str(error),
+            probability=0.0,
+            scale=1.0,
+            dof=self.params.dof if isinstance(self.params.dof, int) else 6,
+            coarse_method=self.params.coarse,
+            hypotheses=(),
+            margin=0.0,
+            fine=None,
+        )
 
     def is_tried(self, one: str, other: str) -> bool:
         """Say whether a pair was registered, either way round."""
@@ -114,6 +145,11 @@ def register_all(
         By cloud, see `pipeline.control`.
     progress : Progress
     clouds : ReducedClouds, of `movers`
+
+    Raises
+    ------
+    RegistrationError
+        No pair's search can start: the reference has too few points, or is not levelled.
     """
     search = _Search(
         movers={mover.name: mover for mover in movers},
@@ -124,6 +160,8 @@ def register_all(
         clouds=clouds,
     )
     parents = _reach(search)
+    if search.errors and len(search.errors) == len(search.tried):
+        raise search.errors[0]
     joined = None
     if len(movers) > 2:
         doubts = _check(search, parents)

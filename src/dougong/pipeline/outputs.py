@@ -79,6 +79,7 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
         It cannot be made.
     """
     shutil.rmtree(folder, ignore_errors=True)
+    had_parent = folder.parent.exists()
     try:
         folder.mkdir(parents=True)
     except OSError as error:
@@ -88,6 +89,9 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+        if not had_parent:
+            with suppress(OSError):  # something to go on from was left in it
+                folder.parent.rmdir()
 
 
 def write_text(path: Path, text: str) -> None:

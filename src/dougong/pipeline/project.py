@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from dougong.errors import InputError
+from dougong.formats import SUFFIXES
+from dougong.formats.registry import kind_of
 from dougong.params import Parameters
 from dougong.pipeline.merging import Merge
 from dougong.pipeline.recipes import Recipe
@@ -139,9 +141,15 @@ def read_project(path: Path) -> Project:
     Raises
     ------
     InputError
-        It is missing, no TOML, has an unknown or wrong key, or asks for what this version
-        cannot do.
+        It is missing, a cloud, no TOML, has an unknown or wrong key, or asks for what this
+        version cannot do.
     """
+    if path.suffix.lower() in SUFFIXES and path.is_file():
+        msg = (
+            f"{path} is a point cloud by its name, expected a project file. Pass it as "
+            f"--lidar {path.name} or --photogrammetry {path.name}."
+        )
+        raise InputError(msg)
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -206,15 +214,41 @@ def files_of(entry: Entry, folder: Path) -> list[Path]:
         matches = [exact] if exact.is_file() else sorted(base.glob(pattern))
         matches = [match for match in matches if match.is_file()]
         if not matches:
-            msg = f"cloud {entry.name!r}: there is no file {text}."
-            if not path.is_absolute():
-                msg = (
-                    f"cloud {entry.name!r}: no file matches {text!r} in {base}. "
-                    "Paths are relative to the project file."
-                )
-            raise InputError(msg)
+            raise InputError(f"cloud {entry.name!r}: {_why_no_file(text, exact, folder)}")
         found += [match for match in matches if match not in found]
     return found
+
+
+def _why_no_file(text: str, exact: Path, folder: Path) -> str:
+    """Return why a path or pattern of a project finds no file, and what to do."""
+    if exact.is_dir():
+        return f"{text} is a folder. Name the files in it, or a pattern such as {text}/*.laz."
+    if Path(text).is_absolute():
+        return f"there is no file {text}."
+    return (
+        f"no file matches {text!r} in {folder.resolve()}. Paths are relative to the project file."
+    )
+
+
+def all_files(project: Project, folder: Path) -> list[Path]:
+    """Return the files of all clouds of a project.
+
+    Raises
+    ------
+    InputError
+        A path or pattern finds no file, or one file is there twice: its points would be too, and
+        would register onto themselves without an error.
+    FormatError
+        One of them is no point cloud.
+    """
+    known: dict[Path, Path] = {}
+    for file in (file for entry in project.cloud for file in files_of(entry, folder)):
+        before = known.setdefault(file.resolve(), file)
+        if before is not file:
+            names = f"{file} is" if before == file else f"{before} and {file} are"
+            raise InputError(f"{names} one file, named twice. Name each file once.")
+        kind_of(file)
+    return list(known.values())
 
 
 def from_files(lidar: Sequence[Path], photogrammetry: Sequence[Path]) -> Project:
@@ -223,12 +257,24 @@ def from_files(lidar: Sequence[Path], photogrammetry: Sequence[Path]) -> Project
     Raises
     ------
     InputError
-        No cloud is named, or two have the same file stem.
+        No cloud is named, one is named twice, or two have the same file stem.
     """
     kinds: list[tuple[Kind, Path]] = [("lidar", path) for path in lidar]
     kinds += [("photogrammetry", path) for path in photogrammetry]
     if not kinds:
         msg = "no cloud is named. Pass a project file, or --lidar FILE and --photogrammetry FILE."
+        raise InputError(msg)
+    names: dict[str, Path] = {}
+    for _, path in kinds:
+        before = names.setdefault(stem(path), path)
+        if before is path:
+            continue
+        if before.resolve() == path.resolve():
+            raise InputError(f"{path} is named twice. Name each file once.")
+        msg = (
+            f"{before} and {path} would both be the cloud {stem(path)!r}: a cloud is called as its "
+            "file is. Rename one, or write a project file (`dougong init DIR`)."
+        )
         raise InputError(msg)
     clouds = [
         {"name": stem(path), "kind": kind, "files": [str(path.resolve())]} for kind, path in kinds

@@ -76,7 +76,10 @@ def register_files(
         pairs=picked,
         control=surveyed,
     )
-    result = replace(result, notes=(*_still_true(result, one, two), *result.notes))
+    said = _still_true(result, one, two)
+    if one.record["sha256"] == two.record["sha256"]:
+        said.insert(0, f"{source.name} and {target.name} are the same file, or copies of one")
+    result = replace(result, notes=(*said, *result.notes))
     measured = None
     if result.status == "ok" or params.accept_best:
         progress.stage(f"measuring {source.name} against {target.name}")

@@ -96,11 +96,17 @@ def updated(model: M, changes: Mapping[str, Any], where: str) -> M:
 
 
 def explain(error: ValidationError, model: type[BaseModel], where: str) -> str:
-    """Return a pydantic error as: where, field, value seen, what was expected."""
-    first = error.errors()[0]
+    """Return a pydantic error as: where, field, value seen, what was expected; then other places.
+
+    A list that has too few items because one of them is wrong is no error of its own.
+    """
+    errors = error.errors()
+    errors = [one for one in errors if one["type"] != "too_short"] or errors
+    first = errors[0]
     path = [str(part) for part in first["loc"]]
-    more = f" ({error.error_count() - 1} more like this.)" if error.error_count() > 1 else ""
-    key = ".".join(path) or model.__name__
+    others = [place_of(one["loc"]) for one in errors[1:]]
+    more = f" Also wrong: {', '.join(others)}." if others else ""
+    key = place_of(first["loc"]) or model.__name__
     if first["type"] == "extra_forbidden":
         known = _fields_at(model, path[:-1])
         return (
@@ -124,6 +130,19 @@ def explain(error: ValidationError, model: type[BaseModel], where: str) -> str:
     expected = said if said[:1].isupper() else f"expected {said}"
     seen = "" if isinstance(first["input"], dict) else f", got {first['input']!r}"
     return f"{where}: {key}{seen}: {expected.rstrip('.')}.{more}"
+
+
+def place_of(path: Sequence[str | int]) -> str:
+    """Return where a setting stands, as a person counts: ``[[cloud]] number 2, files``."""
+    place = ""
+    for part in path:
+        if isinstance(part, int):
+            place = f"[[{place}]] number {part + 1}"
+        elif place.startswith("[["):
+            place += f", {part}"
+        else:
+            place += f".{part}" if place else part
+    return place
 
 
 def _fields_at(model: type[BaseModel], path: Sequence[str]) -> list[str]:

@@ -153,11 +153,7 @@ def prepare(paths: Sequence[Path], scratch: Path, say: Note, pairs: Path | None 
     """
     missing = why_missing()
     if missing is not None:
-        msg = (
-            f"this installation has no viewer ({missing}). Install dougong again with the npm "
-            "registry in reach."
-        )
-        raise InputError(msg)
+        raise InputError(f"this installation has no viewer: {missing}.")
     items, notes = items_of(paths)
     picked, takes = _picking(items, pairs)
     files = [_streamable(item, scratch, index, say, notes) for index, item in enumerate(items)]
