@@ -1,6 +1,7 @@
 """The command line: what is loaded, what is printed where, exit codes, options, docs."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -214,6 +215,19 @@ def test_unexpected_errors_are_one_line_unless_debugged(room, capsys, monkeypatc
     assert err == "error: unexpected RuntimeError: boom. Run again with --debug and report it.\n"
     assert call(["info", str(room), "--quiet", "--debug"]) == 1
     assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_name_that_the_terminal_cannot_show_is_printed_all_the_same(tmp_path):
+    path = tmp_path / "三.xyz"
+    path.write_text("0 0 0\n1 1 1\n1 2 3\n")
+    found = subprocess.run(
+        [sys.executable, "-m", "dougong", "info", str(path), "--quiet"],
+        env={**os.environ, "PYTHONIOENCODING": "ascii:strict"},
+        capture_output=True,
+        check=False,
+    )
+    assert (found.returncode, found.stderr) == (0, b"")
+    assert b"\\u4e09.xyz" in found.stdout
 
 
 def test_commands_are_listed_in_the_order_of_a_survey(capsys):

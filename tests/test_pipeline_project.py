@@ -1,5 +1,6 @@
 """The project file: strict, with errors that name the file and the key; paths and patterns."""
 
+import os
 import re
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from dougong.cloud import Cloud
 from dougong.errors import FormatError, InputError
 from dougong.formats import FileInfo, write
 from dougong.pipeline.guess import Guess, find_clouds, guess_kind, project_text
+from dougong.pipeline.outputs import write_text
 from dougong.pipeline.project import Entry, Project, all_files, files_of, from_files, read_project
 
 DOCS = Path(__file__).parents[1] / "docs" / "commands.md"
@@ -180,6 +182,20 @@ def test_earlier_results_and_hidden_files_are_no_clouds_of_a_survey(tmp_path):
     guesses, skipped = find_clouds(tmp_path)
     assert [guess.file for guess in guesses] == [Path("scan.laz")]
     assert skipped == ["out: a result of dougong", "pose: a result of dougong"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names of other bytes than UTF-8 are POSIX's own")
+def test_a_name_that_is_no_text_is_left_out_and_said(tmp_path):
+    write(Cloud.from_points(np.eye(3)), tmp_path / "scan.laz")
+    old = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.laz"))
+    old.write_bytes((tmp_path / "scan.laz").read_bytes())
+    guesses, skipped = find_clouds(tmp_path)
+    assert [guess.file for guess in guesses] == [Path("scan.laz")]
+    assert skipped == ["caf\udce9.laz: its name is no UTF-8 text. Rename it"]
+    with pytest.raises(InputError, match=r"is no UTF-8 text\. Rename it"):
+        from_files([old], [])
+    write_text(tmp_path / "project.toml", project_text("site", guesses, skipped))
+    assert len(read_project(tmp_path / "project.toml").cloud) == 1
 
 
 NAMES = ['an "odd" name', "祈年殿", "two\nlines\x7f"]

@@ -159,6 +159,9 @@ def _print(text: str) -> bool:
     """Print the answer; say whether it could be, or nobody wants it."""
     if sys.stdout is None:  # closed by whoever started us (`>&-`)
         return True
+    # A file name may hold what the terminal's encoding, or any, does not.
+    encoding = sys.stdout.encoding or "utf-8"
+    text = text.encode(encoding, "backslashreplace").decode(encoding)
     try:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()

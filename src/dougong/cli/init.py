@@ -37,6 +37,7 @@ def command(
         lines += [
             f"  {cloud['name']}: {cloud['kind']} ({cloud['why']})" for cloud in document["clouds"]
         ]
+        lines += [f"  left out: {text}" for text in document["skipped"]]
         lines.append(f"read it, correct it, then: dougong run {document['project']} --out result")
         return Answer(document=document, text="\n".join(lines))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dougong.errors import DougongError, InputError
 from dougong.formats import SUFFIXES, FileInfo, describe
-from dougong.pipeline.project import stem
+from dougong.pipeline.project import is_text, stem
 from dougong.typing import Kind
 
 _COLOURS = {"red", "green", "blue"}
@@ -72,17 +72,21 @@ def find_clouds(folder: Path) -> tuple[list[Guess], list[str]]:
     )
     guesses: list[Guess] = []
     for file in files:
+        inside = file.relative_to(folder)
+        if not is_text(inside):
+            skipped.append(f"{inside}: its name is no UTF-8 text. Rename it")
+            continue
         try:
             info = describe(file)
         except DougongError as error:
-            skipped.append(f"{file.relative_to(folder)}: {error}")
+            skipped.append(f"{inside}: {error}")
             continue
         kind, why = guess_kind(info)
         name = _free_name(stem(file).replace("\\", "-"), (guess.name for guess in guesses))
         guesses.append(
             Guess(
                 name=name,
-                file=file.relative_to(folder),
+                file=inside,
                 kind=kind,
                 why=why,
                 stations=info.stations,
@@ -139,14 +143,15 @@ def project_text(title: str, guesses: list[Guess], skipped: list[str]) -> str:
             "[[cloud]]",
             f"name = {_quoted(guess.name)}",
             f'kind = "{guess.kind}"   # guessed: {guess.why}',
-            f"files = [{_quoted(guess.file.as_posix())}]   # {guess.points:,} points; * works",
+            f"files = [{_quoted(guess.file.as_posix())}]   # {guess.points:,} points; "
+            "patterns such as *.laz work too",
         ]
         if guess.stations > 1:
             lines.append(
                 "registered = true   # false: each of the "
                 f"{guess.stations} stations is registered by itself"
             )
-    lines += [f"# skipped {' '.join(text.split())}" for text in skipped]
+    lines += [f"# left out: {' '.join(text.split())}" for text in skipped]
     return "\n".join([*lines, *_SETTINGS]) + "\n"
 
 

@@ -46,7 +46,9 @@ def transform_file(
             "not moved twice"
         )
     if known.status != "ok":
-        notes.append(f"the pose is the best of several ({known.status}): {known.reason}")
+        notes.append(
+            f"the registration is {known.status}; its best pose is applied: {known.reason}"
+        )
     frame = Frame(crs=known.target_crs, unit_m=known.target_unit_m)
     with watched(output):
         if can_reissue(input, output):

@@ -95,7 +95,10 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file so that it is there whole or not at all.
+    r"""Write a text file so that it is there whole or not at all.
+
+    Bytes of a file name that are no UTF-8 (a name of an old archive) become ``\udc..``, which JSON
+    reads back as the same name.
 
     Raises
     ------
@@ -105,7 +108,7 @@ def write_text(path: Path, text: str) -> None:
     part = part_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("w", encoding="utf-8") as file:
+        with part.open("w", encoding="utf-8", errors="backslashreplace") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())

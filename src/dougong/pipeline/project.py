@@ -266,6 +266,8 @@ def from_files(lidar: Sequence[Path], photogrammetry: Sequence[Path]) -> Project
         raise InputError(msg)
     names: dict[str, Path] = {}
     for _, path in kinds:
+        if not is_text(path):
+            raise InputError(f"the name of {path} is no UTF-8 text. Rename it.")
         before = names.setdefault(stem(path), path)
         if before is path:
             continue
@@ -280,6 +282,12 @@ def from_files(lidar: Sequence[Path], photogrammetry: Sequence[Path]) -> Project
         {"name": stem(path), "kind": kind, "files": [str(path.resolve())]} for kind, path in kinds
     ]
     return validated(Project, {"cloud": clouds}, "the clouds named on the command line")
+
+
+def is_text(path: Path) -> bool:
+    """Say whether a path is UTF-8, which a project file and every result is."""
+    # Python keeps bytes that it cannot decode as these.
+    return not any("\udc80" <= letter <= "\udcff" for letter in str(path))
 
 
 def stem(path: Path) -> str:
