@@ -162,7 +162,7 @@ def test_transform_refuses_a_pose_that_is_not_sure(demo, status, tmp_path, capsy
     code, answer = run(capsys, *tokens, "--accept-best")
     if status == "ambiguous":
         assert code == 0
-        assert any("best of several" in note for note in answer["notes"])
+        assert any("its best pose is applied" in note for note in answer["notes"])
     else:
         assert code == 1
 
