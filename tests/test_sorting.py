@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dougong._sorting import count_rows, distinct, grouped, once, sorted_places
+from dougong._sorting import by_coordinates, count_rows, distinct, grouped, once, sorted_places
 
 SIZES = st.integers(0, 60)
 SOME = [-(2**63), -1, 0, 1, 7, 2**40, 2**63 - 1]
@@ -46,3 +46,16 @@ def test_distinct_is_numpys_unique(keys):
 )
 def test_rows_are_counted_once_each(cells, scale):
     assert count_rows(cells * scale) == len(np.unique(cells, axis=0))
+
+
+@settings(deadline=None)
+@given(
+    arrays(
+        np.float64,
+        st.tuples(SIZES, st.just(3)),
+        elements=st.sampled_from([-np.inf, -1.5, -0.0, 0.0, 1e-300, 2.0, 4e6]),
+    )
+)
+def test_points_are_sorted_by_x_then_y_then_z(points):
+    x, y, z = points.T
+    np.testing.assert_array_equal(by_coordinates(points), np.lexsort((z, y, x)))

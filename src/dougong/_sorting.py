@@ -40,6 +40,23 @@ def sorted_places(keys: NDArray[np.uint64] | NDArray[np.int64]) -> Index:
     return places
 
 
+def by_coordinates(points: NDArray[np.float64]) -> Index:
+    """Return the order of `points` (n, 3) by x, y, z: the same whatever order they came in."""
+    # Adding zero turns -0 into 0, which compares as equal to it.
+    x = points[:, 0] + 0.0
+    bits = x.view(np.uint64)
+    # Of numbers below zero the larger bits are the smaller number.
+    order = sorted_places(np.where(bits & _SIGN, ~bits, bits | _SIGN))
+    x = x[order]
+    is_tied = np.zeros(len(x), np.bool_)
+    is_tied[1:] = x[1:] == x[:-1]
+    is_tied[:-1] |= is_tied[1:]
+    if is_tied.any():
+        tied = order[is_tied]
+        order[is_tied] = tied[np.lexsort(points[tied].T[::-1])]
+    return order
+
+
 def distinct(keys: NDArray[Number]) -> NDArray[Number]:
     """Return each of `keys` (n,) once, ascending.
 

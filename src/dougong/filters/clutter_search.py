@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._sorting import by_coordinates
 from dougong.filters import wires
 from dougong.filters.clusters import (
     Clusters,
@@ -189,8 +190,7 @@ def _offered(
 
 def _by_content(xyz: Points, places: Index) -> Index:
     """Return `places` sorted by x, y, z: the same points wherever they come from."""
-    points = xyz[places]
-    ordered: Index = places[np.lexsort((points[:, 2], points[:, 1], points[:, 0]))]
+    ordered: Index = places[by_coordinates(xyz[places])]
     return ordered
 
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from dougong.kernels._arrays import Floats, Ints
+from dougong.kernels._arrays import Floats, Ints, Small
 from dougong.kernels._jit import kernel
 
 
@@ -98,7 +98,12 @@ def describe(
 
 @kernel
 def describe_neighbours(
-    points: Floats, places: Ints, first: int, normals: Floats, variation: Floats, planarity: Floats
+    points: Floats,
+    places: Ints | Small,
+    first: int,
+    normals: Floats,
+    variation: Floats,
+    planarity: Floats,
 ) -> None:
     """Describe the neighbourhood of each sorted point first .. first + m - 1, itself included.
 

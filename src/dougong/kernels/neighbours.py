@@ -15,7 +15,61 @@ from dougong.kernels.boxtree import (
     points_under,
 )
 
-_DEPTH = 64
+DEPTH = 64
+"""Nodes that a search can have before it, at most."""
+
+
+@kernel
+def nearest_one(
+    points: Floats,
+    boxes: Floats,
+    x: float,
+    y: float,
+    z: float,
+    max_distance2: float,
+    stack: Ints,
+    bound: Floats,
+) -> tuple[int, float]:
+    """Return the nearest sorted point to x, y, z and its squared distance; -1 and inf if none.
+
+    Within max_distance2, inclusive. stack and bound (DEPTH,): room to work in.
+    """
+    n = points.shape[0]
+    leaves = boxes.shape[0] // 2
+    best = max_distance2
+    place = -1
+    stack[0] = 1
+    bound[0] = box_distance2(boxes, 1, x, y, z)
+    height = 1
+    while height > 0:
+        height -= 1
+        if bound[height] > best:
+            continue
+        node = stack[height]
+        while node < leaves:
+            left = box_distance2(boxes, 2 * node, x, y, z)
+            right = box_distance2(boxes, 2 * node + 1, x, y, z)
+            near = 2 * node if left <= right else 2 * node + 1
+            far = max(left, right)
+            if far <= best:
+                stack[height] = 4 * node + 1 - near
+                bound[height] = far
+                height += 1
+            if min(left, right) > best:
+                break
+            node = near
+        if node < leaves:
+            continue
+        leaf = node - leaves
+        for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
+            dx = points[i, 0] - x
+            dy = points[i, 1] - y
+            dz = points[i, 2] - z
+            d2 = dx * dx + dy * dy + dz * dz
+            if d2 <= best and (d2 < best or place < 0 or comes_first(points, i, place)):
+                best = d2
+                place = i
+    return place, best if place >= 0 else np.inf
 
 
 @kernel
@@ -32,47 +86,19 @@ def nearest(
     points (n, 3), boxes (2 leaves, 6); out_place (m,) int64, -1 where none is in reach;
     out_distance2 (m,), inf where none is.
     """
-    n = points.shape[0]
-    leaves = boxes.shape[0] // 2
-    stack = np.empty(_DEPTH, np.int64)
-    bound = np.empty(_DEPTH, np.float64)
+    stack = np.empty(DEPTH, np.int64)
+    bound = np.empty(DEPTH, np.float64)
     for q in range(queries.shape[0]):
-        x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
-        best = max_distance2
-        place = -1
-        stack[0] = 1
-        bound[0] = box_distance2(boxes, 1, x, y, z)
-        height = 1
-        while height > 0:
-            height -= 1
-            if bound[height] > best:
-                continue
-            node = stack[height]
-            while node < leaves:
-                left = box_distance2(boxes, 2 * node, x, y, z)
-                right = box_distance2(boxes, 2 * node + 1, x, y, z)
-                near = 2 * node if left <= right else 2 * node + 1
-                far = max(left, right)
-                if far <= best:
-                    stack[height] = 4 * node + 1 - near
-                    bound[height] = far
-                    height += 1
-                if min(left, right) > best:
-                    break
-                node = near
-            if node < leaves:
-                continue
-            leaf = node - leaves
-            for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
-                dx = points[i, 0] - x
-                dy = points[i, 1] - y
-                dz = points[i, 2] - z
-                d2 = dx * dx + dy * dy + dz * dz
-                if d2 <= best and (d2 < best or place < 0 or comes_first(points, i, place)):
-                    best = d2
-                    place = i
-        out_place[q] = place
-        out_distance2[q] = best if place >= 0 else np.inf
+        out_place[q], out_distance2[q] = nearest_one(
+            points,
+            boxes,
+            queries[q, 0],
+            queries[q, 1],
+            queries[q, 2],
+            max_distance2,
+            stack,
+            bound,
+        )
 
 
 @kernel
@@ -185,8 +211,8 @@ def knn(
     places (m, k) int64 and d2s (m, k) are filled; -1 and inf where fewer than k are in reach
     (max_distance2, inclusive).
     """
-    stack = np.empty(_DEPTH, np.int64)
-    bound = np.empty(_DEPTH, np.float64)
+    stack = np.empty(DEPTH, np.int64)
+    bound = np.empty(DEPTH, np.float64)
     k = d2s.shape[1]
     near = np.empty(k, np.int64)
     near_d2 = np.empty(k, np.float64)
@@ -220,7 +246,7 @@ def count_within(points: Floats, boxes: Floats, queries: Floats, radius2: float,
     """
     n = points.shape[0]
     leaves = boxes.shape[0] // 2
-    stack = np.empty(_DEPTH, np.int64)
+    stack = np.empty(DEPTH, np.int64)
     for q in range(queries.shape[0]):
         x, y, z = queries[q, 0], queries[q, 1], queries[q, 2]
         total = 0
@@ -265,7 +291,7 @@ def sum_distances(
     """
     n = points.shape[0]
     leaves = boxes.shape[0] // 2
-    stack = np.empty(_DEPTH, np.int64)
+    stack = np.empty(DEPTH, np.int64)
     for q in range(start, stop):
         x, y, z = points[q, 0], points[q, 1], points[q, 2]
         total = 0

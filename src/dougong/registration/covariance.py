@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong._sorting import grouped
+from dougong._boxes import corners_of
+from dougong._sorting import distinct, grouped
 from dougong.registration.icp_solve import FREE, normal_equations, plane_rows, solve
 from dougong.registration.overlap import Pairs
 from dougong.typing import Index, Points, Values
@@ -27,12 +28,21 @@ _DRAWN_POINTS = 400
 
 def blocks_of(points: Points, size_m: float) -> tuple[Index, int]:
     """Return the block (n,) each point lies in, numbered in space, and how many there are."""
-    cell = np.floor(points / size_m).astype(np.int64)
-    cell -= cell.min(axis=0)
-    size = cell.max(axis=0) + 1
-    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
-    blocks = grouped(key)
+    blocks = grouped(_block_keys(points, size_m))
     return blocks.place, len(blocks.keys)
+
+
+def count_blocks(points: Points, size_m: float) -> int:
+    """Return how many blocks `points` (n, 3), n > 0, lie in."""
+    return len(distinct(_block_keys(points, size_m)))
+
+
+def _block_keys(points: Points, size_m: float) -> NDArray[np.int64]:
+    low, high = (np.floor(corner / size_m).astype(np.int64) for corner in corners_of(points))
+    cell = np.floor(points / size_m).astype(np.int64) - low
+    size = high - low + 1
+    key: NDArray[np.int64] = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+    return key
 
 
 class Jackknife(NamedTuple):
@@ -156,7 +166,7 @@ def _growths(points: Points, block_m: float) -> list[float]:
 
     All from 1 on that leave enough blocks; where there is none, the largest that does.
     """
-    enough = [g for g in _BLOCK_GROWTH if blocks_of(points, g * block_m)[1] >= _LEAST_BLOCKS]
+    enough = [g for g in _BLOCK_GROWTH if count_blocks(points, g * block_m) >= _LEAST_BLOCKS]
     return sorted(g for g in enough if g >= 1.0) or enough[:1]
 
 

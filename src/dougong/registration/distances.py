@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from dougong._sorting import by_coordinates
 from dougong.errors import InputError
 from dougong.filters import neighbourhood
 from dougong.filters.neighbourhood import Neighbourhood
@@ -231,7 +232,7 @@ def _core_points(
         if params.core_spacing_m is not None or len(core) <= params.max_core_points:
             break
         spacing *= max(1.05, 1.02 * float(np.sqrt(len(core) / params.max_core_points)))
-    core = core[np.lexsort((core[:, 2], core[:, 1], core[:, 0]))]
+    core = core[by_coordinates(core)]
     return core, replace(scales, core_spacing_m=spacing)
 
 

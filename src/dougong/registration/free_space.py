@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong.kernels import sights
+from dougong.threads import for_blocks
 from dougong.typing import Index, Mask, Points, Values
 
 _CELL = np.radians(1.5)
@@ -33,6 +35,9 @@ _BESIDE_M = 4.0
 _TRIED_CELL = np.radians(3.0)
 _FOUND_CELL = np.radians(2.0)
 _HIDDEN = (1.15, 0.5)
+"""A point is hidden beyond so many times the nearest range in its direction, and so much more."""
+_PLACES = 8
+"""Places per task."""
 _MOST_HIDDEN = 0.03
 # Four metres beside, so much more must be hidden in the typical direction: this many times, and
 # this share.
@@ -106,28 +111,27 @@ def find_place(points: Points) -> NDArray[np.float64] | None:
     tried = _eye_places(few)
     if not len(tried):
         return None
-    order = np.argsort([_hidden(few, place, _TRIED_CELL) for place in tried], kind="stable")
+    order = np.argsort(_hidden(few, tried, _TRIED_CELL), kind="stable")
     found = [_settled(few, tried[k]) for k in order[:_STARTS]]
     least, best = min(found, key=lambda item: item[0])
-    ring = [
-        best + _RING_M * np.array([np.cos(t), np.sin(t), 0.0]) for t in np.arange(8) * np.pi / 4
-    ]
-    beside = [_hidden(few, place, _FOUND_CELL) for place in ring]
+    turns = np.arange(8) * np.pi / 4
+    ring = best + _RING_M * np.column_stack([np.cos(turns), np.sin(turns), np.zeros(8)])
+    beside = _hidden(few, ring, _FOUND_CELL)
     is_apart = float(np.median(beside)) >= _TYPICAL[0] * least + _TYPICAL[1]
-    is_alone = min(beside) >= least + _LEAST
+    is_alone = beside.min() >= least + _LEAST
     return best if least <= _MOST_HIDDEN and is_apart and is_alone else None
 
 
 def _settled(points: Points, place: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
     """Return how little is hidden from the best place near `place`, and that place."""
-    least, step = _hidden(points, place, _FOUND_CELL), 1.0
+    least, step = float(_hidden(points, place[None], _FOUND_CELL)[0]), 1.0
     lowest, highest = place[2] - _EYE_SPREAD_M, place[2] + _EYE_SPREAD_M
     while step > _FINEST_M:
-        around = [place + step * move for move in _MOVES]
-        around = [near for near in around if lowest <= near[2] <= highest]
-        costs = [_hidden(points, near, _FOUND_CELL) for near in around]
-        if min(costs) < least:
-            least, place = min(costs), around[int(np.argmin(costs))]
+        around = place + step * _MOVES
+        around = around[(lowest <= around[:, 2]) & (around[:, 2] <= highest)]
+        costs = _hidden(points, around, _FOUND_CELL)
+        if costs.min() < least:
+            least, place = float(costs.min()), around[int(np.argmin(costs))]
         else:
             step /= 2.0
     return least, place
@@ -162,14 +166,16 @@ def _eye_places(points: Points) -> Points:
     return places
 
 
-def _hidden(points: Points, place: NDArray[np.float64], cell: float) -> float:
-    """Return the share of points that others would hide from `place`."""
-    rows = round(np.pi / cell)
-    row, column, distance = _directions(points, place, rows)
-    nearest = np.full((rows, 2 * rows), np.inf)
-    np.minimum.at(nearest, (row, column), distance)
-    factor, extra = _HIDDEN
-    return float(np.mean(distance > factor * nearest[row, column] + extra))
+def _hidden(points: Points, places: Points, cell: float) -> Values:
+    """Return the share of points that others would hide from each of `places` (k, 3)."""
+    points, places = np.ascontiguousarray(points), np.ascontiguousarray(places)
+    shares = np.empty(len(places))
+
+    def task(start: int, stop: int) -> None:
+        sights.hidden_shares(points, places, round(np.pi / cell), *_HIDDEN, start, stop, shares)
+
+    for_blocks(len(places), _PLACES, task)
+    return shares
 
 
 def _ranges(points: Points, place: NDArray[np.float64]) -> NDArray[np.float64]:

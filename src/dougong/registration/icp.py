@@ -13,7 +13,7 @@ from pydantic import Field
 from dougong._checks import as_transform
 from dougong.errors import RegistrationError
 from dougong.params import Parameters
-from dougong.registration.covariance import Jackknife, blocks_of, jackknife, unobservable
+from dougong.registration.covariance import Jackknife, count_blocks, jackknife, unobservable
 from dougong.registration.icp_solve import (
     Robust,
     gravity_prior,
@@ -152,16 +152,19 @@ def refine_levels(levels: tuple[Level, ...], T_initial: Transform, params: Icp) 
 
 def refined_pose(levels: tuple[Level, ...], T_initial: Transform, params: Icp) -> Transform:
     """Return the pose of `refine` alone, on levels built before: a third of the work is figures."""
-    return _climbed(levels, T_initial, params, [])[0]
+    return _climbed(levels, T_initial, params, None)[0]
 
 
 def _climbed(
     levels: tuple[Level, ...],
     T_initial: Transform,
     params: Icp,
-    history: list[Mapping[str, float]],
+    history: list[Mapping[str, float]] | None,
 ) -> tuple[Transform, str]:
-    """Return the pose at the top of the levels, and why its last level ended."""
+    """Return the pose at the top of the levels, and why its last level ended.
+
+    What every step found is added to `history`, if there is one.
+    """
     T = as_transform(T_initial, "T_initial")
     if params.dof == 4:
         T = levelled(T, levels[-1].target.xyz.mean(axis=0))
@@ -178,7 +181,7 @@ def _run_level(
     params: Icp,
     number: int,
     tolerance_m: float,
-    history: list[Mapping[str, float]],
+    history: list[Mapping[str, float]] | None,
 ) -> tuple[Transform, str]:
     cosine = float(np.cos(np.radians(params.normal_angle_deg)))
     for _ in range(params.max_iterations):
@@ -192,15 +195,16 @@ def _run_level(
         step = _step(pairs, weights, T, centre, length, scale, level, params)
         T = moved_by(T, step, centre)
         motion = float(np.linalg.norm(step[:3]) * length + np.linalg.norm(step[3:]))
-        history.append(
-            {
-                "level": float(number),
-                "max_distance_m": level.bound_m,
-                "inlier_rmse_m": _rms(_distance(pairs, params), weights),
-                "fitness": _asked_share(pairs.source, level),
-                "step_m": motion,
-            }
-        )
+        if history is not None:
+            history.append(
+                {
+                    "level": float(number),
+                    "max_distance_m": level.bound_m,
+                    "inlier_rmse_m": _rms(_distance(pairs, params), weights),
+                    "fitness": _asked_share(pairs.source, level),
+                    "step_m": motion,
+                }
+            )
         if motion < tolerance_m:
             return T, f"the last step moved the overlap by less than {1e3 * tolerance_m:.3g} mm"
     return T, f"{params.max_iterations} iterations at {level.bound_m:.3g} m without coming to rest"
@@ -242,7 +246,7 @@ def _step(
     params: Icp,
 ) -> NDArray[np.float64]:
     """Return the motion (6,) of one Gauss-Newton step."""
-    blocks = blocks_of(pairs.points, params.block_m)[1]
+    blocks = count_blocks(pairs.points, params.block_m)
     block = np.zeros(len(weights), dtype=np.int64)
     arms = pairs.points - centre
     if params.method == "point-to-plane":

@@ -12,12 +12,17 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from dougong._sorting import sorted_places
+from dougong._boxes import corners_of
+from dougong._sorting import by_coordinates, sorted_places
 from dougong.filters import neighbourhood
 from dougong.filters.neighbourhood import Neighbourhood, build_index
+from dougong.kernels import partners
 from dougong.registration.prepare import Prepared
+from dougong.threads import for_blocks
 from dougong.typing import Index, Mask, Points, Transform, Values
 
+_SEARCHES = 4096
+"""Searches per task: fixed, so results do not depend on the thread count."""
 _GROWTH = 1.3
 _FEWEST = 1000
 _TOP = 0.5
@@ -48,6 +53,18 @@ class Rung:
     asked: Index
     """(m,) the evenly spread part of the points that look for a partner."""
 
+    @property
+    def side(self) -> partners.Side:
+        """Return what kernels ask of a pair's end."""
+        return partners.Side(
+            self.xyz, self.normals, self.is_oriented, self.is_top, self.may_be_underside
+        )
+
+    @property
+    def tree(self) -> partners.Tree:
+        """Return the search index as kernels take it."""
+        return partners.Tree(self.neighbours.points, self.neighbours.boxes, self.neighbours.order)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pairs:
@@ -73,11 +90,11 @@ def thin(points: Points, spacing_m: float) -> Index:
     Sorted by voxel. Ties go to the earlier point, so with `points` (n, 3) in canonical order the
     choice does not depend on the order of the input.
     """
-    low = np.floor(points.min(axis=0) / spacing_m)
+    low, high = (np.floor(corner / spacing_m) for corner in corners_of(points))
     cell = np.floor(points / spacing_m)
     off = points / spacing_m - cell - 0.5
     cell -= low
-    size = cell.max(axis=0) + 1.0
+    size = high - low + 1.0
     key = ((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]).astype(np.int64)
     # Numbers that are not negative are in the order of their bits.
     by_distance = sorted_places(np.einsum("ij,ij->i", off, off).view(np.uint64))
@@ -106,7 +123,7 @@ def _ladder(prepared: Prepared) -> tuple[_Thinned, ...]:
     if known is not None:
         return known
     xyz = prepared.xyz
-    index = np.lexsort((xyz[:, 2], xyz[:, 1], xyz[:, 0])).astype(np.int64)
+    index = by_coordinates(xyz)
     steps = [_Thinned(prepared.spacing_m, index)]
     while len(steps[-1].index) > _FEWEST:
         spacing = steps[-1].spacing_m * _GROWTH
@@ -191,46 +208,52 @@ def find_pairs(
         Also look from the target for the nearest source point, so that neither cloud's density
         decides which surface counts.
     """
-    to, _ = neighbourhood.nearest(target.neighbours, apply(T, source.xyz[source.asked]), bound_m)
+    to = _partners(source, target, T, bound_m, cosine)
     hit = to >= 0
     s, t = source.asked[hit], to[hit]
     if both_ways:
-        back = apply(inverse(T), target.xyz[target.asked])
-        to, _ = neighbourhood.nearest(source.neighbours, back, bound_m)
+        to = _partners(target, source, inverse(T), bound_m, cosine)
         hit = to >= 0
         s, t = np.concatenate([s, to[hit]]), np.concatenate([t, target.asked[hit]])
-    a, b = source.normals[s] @ T[:3, :3].T, target.normals[t]
-    is_oriented = source.is_oriented[s] & target.is_oriented[t]
-    keep = do_agree(a, b, is_oriented, cosine) & ~_are_of_a_slab(source, target, s, t)
-    s, t, a, b = s[keep], t[keep], a[keep], b[keep]
-    normals = _mean_normals(a, b, source.sigma_m, target.sigma_m)
-    moved = apply(T, source.xyz[s])
-    offsets = moved - target.xyz[t]
+    return _described(source, target, T, s, t)
+
+
+def _partners(source: Rung, target: Rung, T: Transform, bound_m: float, cosine: float) -> Index:
+    """Return the place in `target` (m,) that each asked point of `source` meets; -1 for none."""
+    found = np.empty(len(source.asked), np.int64)
+
+    def task(start: int, stop: int) -> None:
+        partners.find(
+            source.side, source.asked, target.side, target.tree,
+            T, bound_m**2, cosine, start, stop, found,
+        )  # fmt: skip
+
+    for_blocks(len(found), _SEARCHES, task)
+    return found
+
+
+def _described(source: Rung, target: Rung, T: Transform, s: Index, t: Index) -> Pairs:
+    """Return the pairs of the points `s` and `t` (k,).
+
+    A pair's normal is the mean weighted by 1 / sigma^2: a noisy cloud has noisy normals.
+    """
+    k = len(s)
+    points, normals, offsets = np.empty((k, 3)), np.empty((k, 3)), np.empty((k, 3))
+    residuals = np.empty(k)
+    trust_source, trust_target = (1.0 / max(r.sigma_m, 1e-6) ** 2 for r in (source, target))
+    partners.describe(
+        source.side, target.side, T, s, t, trust_source, trust_target,
+        points, normals, offsets, residuals,
+    )  # fmt: skip
     return Pairs(
         source=s,
         target=t,
-        points=moved,
+        points=points,
         normals=normals,
-        residuals=np.einsum("ij,ij->i", normals, offsets),
+        residuals=residuals,
         offsets=offsets,
         weights=np.sqrt(source.weights[s] * target.weights[t]),
     )
-
-
-def _are_of_a_slab(source: Rung, target: Rung, s: Index, t: Index) -> Mask:
-    """Say which pairs may be the two sides of one roof: a top, and what may be an underside."""
-    one: Mask = source.may_be_underside[s] & target.is_top[t]
-    return one | (target.may_be_underside[t] & source.is_top[s])
-
-
-def _mean_normals(a: Points, b: Points, sigma_a: float, sigma_b: float) -> Points:
-    """Return unit means of normals weighted by 1/sigma^2: a noisy cloud has noisy normals."""
-    sign = np.sign(np.einsum("ij,ij->i", a, b))
-    sign[sign == 0] = 1.0
-    weight_a, weight_b = 1.0 / max(sigma_a, 1e-6) ** 2, 1.0 / max(sigma_b, 1e-6) ** 2
-    mean = weight_a * a + weight_b * sign[:, None] * b
-    unit: Points = mean / np.linalg.norm(mean, axis=1, keepdims=True)
-    return unit
 
 
 def overlap_share(from_: Rung, to: Rung, T: Transform, bound_m: float) -> float:

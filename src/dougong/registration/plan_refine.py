@@ -28,13 +28,20 @@ class PlanPose:
     """Masked normalised correlation."""
 
 
-def suppress(poses: Sequence[PlanPose], yaw_deg: float, distance_m: float) -> list[PlanPose]:
-    """Keep the best of poses within `yaw_deg` and `distance_m` of each other, best first."""
+def suppress(
+    poses: Sequence[PlanPose], yaw_deg: float, distance_m: float, most: int | None = None
+) -> list[PlanPose]:
+    """Keep the best of poses within `yaw_deg` and `distance_m` of each other, best first.
+
+    No more than `most`, if it is given.
+    """
     ordered = sorted(poses, key=lambda pose: (-pose.score, pose.yaw, pose.x, pose.y))
     table = np.array([(pose.yaw, pose.x, pose.y) for pose in ordered]).reshape(-1, 3)
     is_left = np.ones(len(ordered), dtype=bool)
     kept: list[PlanPose] = []
     for index, pose in enumerate(ordered):
+        if len(kept) == most:
+            break
         if is_left[index]:
             kept.append(pose)
             turn = np.abs((table[:, 0] - pose.yaw + np.pi) % (2 * np.pi) - np.pi)

@@ -99,7 +99,7 @@ def search(source: PlanView, target: PlanView, params: PlanSearch) -> list[PlanP
     """Return the best separate poses in plan, refined, best correlation first."""
     cell = _cell(source, target, params)
     peaks = _first_peaks(source, target, cell, params)
-    kept = suppress(peaks, 0.75 * params.yaw_step_deg, 1.5 * cell)[: params.peaks]
+    kept = suppress(peaks, 0.75 * params.yaw_step_deg, 1.5 * cell, params.peaks)
     step = params.yaw_step_deg
     while True:
         kept = refine(kept, source, target, cell, step, params.wall_share, params.min_overlap)

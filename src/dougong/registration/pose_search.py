@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._sorting import by_coordinates
 from dougong.filters import neighbourhood
 from dougong.kernels import poses as kernels
 from dougong.threads import for_blocks
@@ -47,15 +48,9 @@ class Field:
     cell_m: float
 
 
-def canonical_order(points: Points) -> Index:
-    """Return the order of `points` (n, 3) by x, y, z: the same whatever order they came in."""
-    order: Index = np.lexsort((points[:, 2], points[:, 1], points[:, 0])).astype(np.int64)
-    return order
-
-
 def view_of(points: Points, normals: Points, spacing_m: float) -> View:
     """Return `points` and `normals` (n, 3) as a view."""
-    order = canonical_order(points)
+    order = by_coordinates(points)
     centre = points[order].mean(axis=0)
     return View(
         points=np.ascontiguousarray(points[order] - centre),

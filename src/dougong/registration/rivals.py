@@ -8,15 +8,17 @@ like every other pose (METHOD.md 2.3).
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.filters import neighbourhood
+from dougong.kernels import partners
 from dougong.registration.evidence import Court, Testimony
 from dougong.registration.icp_solve import rotation_of
-from dougong.registration.overlap import apply, do_agree
+from dougong.registration.overlap import apply
+from dougong.threads import for_blocks
 from dougong.typing import Mask, Points, Transform, Values
 
 SAME_YAW_DEG = 5.0
@@ -25,6 +27,9 @@ _SAMPLE = 1500
 _TURN_STEP_DEG = 5.0
 _SHIFT_STEP_M = 0.25
 _REACH_M = 1.0
+_LIKE_COSINE = 0.7
+_MOVES = 4
+"""Poses per task of the quick score."""
 # Of what the winner itself reaches in the quick score, a pose worth refining reaches so much.
 _WORTH = 0.4
 _NEAR_REACH_M = 0.3
@@ -83,13 +88,13 @@ def propose_rivals(court: Court, winner: Testimony, most: int) -> list[Transform
     shifts = _shifts(structure)
     step = max(1, len(structure) // _SAMPLE)
     structure, normals = structure[::step], normals[::step]
-    worth = _WORTH * _quick_score(court, np.eye(4), structure, normals)
+    worth = _WORTH * float(_quick_scores(court, [np.eye(4)], structure, normals)[0])
     turns = [move for middle in middles for move in _turns(middle)]
     rivals: list[Transform] = []
     for families, count in (([turns], most), (shifts, most // 2)):
         found: list[tuple[float, Transform]] = []
         for family in families:
-            scores = np.array([_quick_score(court, move, structure, normals) for move in family])
+            scores = _quick_scores(court, family, structure, normals)
             found += [(scores[k], family[k]) for k in _peaks(scores) if scores[k] > worth]
         found.sort(key=lambda item: -item[0])
         kept: list[Transform] = []
@@ -114,12 +119,11 @@ def propose_neighbours(court: Court, winner: Testimony, most: int) -> list[Trans
     middle, axes = middle_of(structure), _plan_axes(structure)
     step = max(1, len(structure) // _SAMPLE)
     structure, normals = structure[::step], normals[::step]
-    worth = _NEAR_WORTH * _quick_score(court, np.eye(4), structure, normals, _NEAR_REACH_M)
+    own = _quick_scores(court, [np.eye(4)], structure, normals, _NEAR_REACH_M)
+    worth = _NEAR_WORTH * float(own[0])
     found: list[tuple[float, Transform]] = []
     for family in _near_families(middle, axes):
-        scores = np.array(
-            [_quick_score(court, move, structure, normals, _NEAR_REACH_M) for move in family]
-        )
+        scores = _quick_scores(court, family, structure, normals, _NEAR_REACH_M)
         found += [(scores[k], family[k]) for k in _peaks(scores) if scores[k] > worth]
     found.sort(key=lambda item: -item[0])
     return [move @ winner.T for _, move in found[:most]]
@@ -165,7 +169,7 @@ def propose_mirrored(court: Court, winner: Testimony, most: int) -> list[Transfo
     middles = _middles(court, winner, explained)
     for middle in middles[:2]:
         family = _reflections(middle)
-        scores = np.array([_quick_score(court, move, structure, normals) for move in family])
+        scores = _quick_scores(court, family, structure, normals)
         # The family closes on itself: no end leans on anything.
         is_peak = (scores >= np.roll(scores, 1)) & (scores > np.roll(scores, -1))
         found += [(scores[k], family[k]) for k in np.flatnonzero(is_peak)]
@@ -237,28 +241,36 @@ def _settled(court: Court, move: Transform, points: Points, normals: Points) -> 
     points, normals = points[::step], normals[::step]
     best = move
     for grid, reach in ((0.6, _REACH_M), (0.2, 0.4 * _REACH_M)):
-        centre, best_score = best, -1.0
         reached = 5 if grid > 0.5 else 3
+        trials = []
         for i, j in itertools.product(range(-reached, reached + 1), repeat=2):
-            trial = centre.copy()
+            trial = best.copy()
             trial[:2, 3] += (grid * i, grid * j)
-            score = _quick_score(court, trial, points, normals, reach)
-            if score > best_score:
-                best, best_score = trial, score
+            trials.append(trial)
+        best = trials[int(np.argmax(_quick_scores(court, trials, points, normals, reach)))]
     return best
 
 
-def _quick_score(
-    court: Court, move: Transform, points: Points, normals: Points, reach_m: float = _REACH_M
-) -> float:
-    """Return how near `points` (n, 3) come to like surfaces within `reach_m` after `move`."""
+def _quick_scores(
+    court: Court,
+    moves: Sequence[Transform],
+    points: Points,
+    normals: Points,
+    reach_m: float = _REACH_M,
+) -> Values:
+    """Return how near `points` (n, 3) come to like surfaces within `reach_m` after each move."""
     everything = court.target.everything
-    index, distance = neighbourhood.nearest(everything.neighbours, apply(move, points), reach_m)
-    is_near = index >= 0
-    turned = normals @ move[:3, :3].T
-    other = everything.normals[np.where(is_near, index, 0)]
-    closeness = np.where(is_near, 1.0 - distance / reach_m, 0.0)
-    return float(np.mean(closeness * do_agree(turned, other, np.zeros(len(other), bool), 0.7)))
+    scores = np.empty(len(moves))
+    stacked = np.ascontiguousarray(moves, dtype=np.float64)
+
+    def task(start: int, stop: int) -> None:
+        partners.closeness(
+            points, normals, stacked, everything.tree, everything.normals,
+            reach_m, _LIKE_COSINE, start, stop, scores,
+        )  # fmt: skip
+
+    for_blocks(len(moves), _MOVES, task)
+    return scores
 
 
 def _peaks(scores: Values) -> list[int]:

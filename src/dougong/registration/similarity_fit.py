@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong.filters.neighbourhood import build_index
-from dougong.registration.covariance import Jackknife, blocks_of, leave_blocks_out
+from dougong.registration.covariance import Jackknife, blocks_of, count_blocks, leave_blocks_out
 from dougong.registration.icp import Icp, Level, build_levels, centre_and_length
 from dougong.registration.icp_solve import (
     gravity_prior,
@@ -173,7 +173,7 @@ def _step(
         prior,
         weight_sum=float(fitted.weights.sum()),
         scale_m=fitted.scale_m,
-        blocks=blocks_of(fitted.pairs.points, icp.block_m)[1],
+        blocks=count_blocks(fitted.pairs.points, icp.block_m),
     )
     return _solved(H, g, free, fitted.length), fitted.length
 
