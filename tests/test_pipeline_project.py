@@ -12,7 +12,15 @@ from dougong.errors import FormatError, InputError
 from dougong.formats import FileInfo, write
 from dougong.pipeline.guess import Guess, find_clouds, guess_kind, project_text
 from dougong.pipeline.outputs import write_text
-from dougong.pipeline.project import Entry, Project, all_files, files_of, from_files, read_project
+from dougong.pipeline.project import (
+    Entry,
+    Project,
+    all_files,
+    files_of,
+    from_files,
+    read_project,
+    refuse_own_result,
+)
 
 DOCS = Path(__file__).parents[1] / "docs" / "commands.md"
 GOOD = """
@@ -131,6 +139,15 @@ def test_what_is_no_cloud_is_said_before_any_work(tmp_path):
             files_of(Entry(name="s", kind="lidar", files=(text,)), tmp_path)
     with pytest.raises(InputError, match=r"point cloud by its name.* --lidar a.laz or --photo"):
         read_project(tmp_path / "a.laz")
+
+
+def test_an_earlier_result_is_no_input_of_the_next(tmp_path):
+    files = [tmp_path / "a.laz", tmp_path / "out" / "clouds" / "a.laz"]
+    refuse_own_result(files[:1], tmp_path / "out")
+    refuse_own_result([tmp_path / "out" / "scene" / "a.laz"], tmp_path / "out")
+    refuse_own_result(files, tmp_path / "elsewhere")
+    with pytest.raises(InputError, match=r"clouds/a.laz is part of the result in .*another --out"):
+        refuse_own_result(files, tmp_path / "out")
 
 
 def test_a_file_name_with_brackets_is_found_as_it_is(tmp_path):

@@ -18,7 +18,7 @@ from dougong.report.layers import BLUE, COLOURS, Layer, rigid_inverse
 from dougong.report.links import network_rows
 from dougong.report.model import flat, from_registration, from_run
 from dougong.report.plates import length_text, line_chart, plate, round_length
-from dougong.report.render import render
+from dougong.report.render import environment, render
 
 TOP = View(
     right=np.array([1.0, 0, 0]),
@@ -127,7 +127,7 @@ def text(layers):
 class Page(HTMLParser):
     """Tags in order, and whether each closes the one it should."""
 
-    VOID = frozenset({"meta", "link", "br", "image", "path", "rect", "circle", "polyline"})
+    VOID = frozenset({"meta", "link", "br", "wbr", "image", "path", "rect", "circle", "polyline"})
 
     def __init__(self, text):
         super().__init__()
@@ -246,10 +246,17 @@ def test_a_registration_without_a_fine_fit_can_be_shown():
 
 
 def test_nested_parameters_become_dotted_names():
-    rows = flat({"filter": {"lidar": {"voxel_m": 0.005, "depth": None}}, "files": ["a", "b"]})
+    lidar = {"voxel_m": 0.005, "depth": None, "holes": [], "is_on": True}
+    rows = flat({"filter": {"lidar": lidar}, "files": ["a", "b"]})
     assert rows == [
-        ("filter.lidar.voxel_m", "0.005"), ("filter.lidar.depth", "not set"), ("files", "a, b"),
+        ("filter.lidar.voxel_m", "0.005"), ("filter.lidar.depth", "not set"),
+        ("filter.lidar.holes", "none"), ("filter.lidar.is_on", "true"), ("files", "a, b"),
     ]  # fmt: skip
+
+
+def test_long_names_of_parameters_break_behind_their_parts():
+    shown = environment().from_string("{{ name|breakable }}").render(name="filter.<b>.voxel_m")
+    assert shown == "filter.<wbr>&lt;b&gt;.<wbr>voxel_<wbr>m"
 
 
 def test_a_folder_without_a_result_is_one_sentence(tmp_path):

@@ -107,6 +107,16 @@ def test_signs_stand_where_cells_agree_and_nowhere_else():
     assert signs(sheet, values, np.isfinite(values)).count("<text") < 5
 
 
+def test_the_lines_of_the_key_lie_inside_it_and_apart_even_in_large_letters():
+    svg = signed_scale(0.02, 0.005, "a", "b")
+    height = float(re.search(r'viewBox="0 0 \d+ (\d+)"', svg)[1])
+    lines = sorted({float(y) for y in re.findall(r'<text x="[^"]*" y="(\d+)"', svg)})
+    letters = 21.0  # of a narrow page
+    assert lines[0] >= 0.8 * letters
+    assert lines[-1] + 0.3 * letters <= height
+    assert min(np.diff(lines)) >= letters
+
+
 def test_names_in_the_key_are_escaped():
     assert "<img" not in signed_scale(0.02, 0.005, "<img src=x> behind", "b")
 

@@ -263,7 +263,7 @@ def run_project(
     """
     from dougong.pipeline.memory import Room
     from dougong.pipeline.outputs import refuse_existing, result_folder
-    from dougong.pipeline.project import all_files, asked_project
+    from dougong.pipeline.project import all_files, asked_project, refuse_own_result
     from dougong.pipeline.refusals import refuse_full_disk, refuse_or_announce
     from dougong.pipeline.run import run
 
@@ -271,6 +271,7 @@ def run_project(
     refuse_existing([out / "result.json"], overwrite)
     asked, folder = asked_project(project, lidar, photogrammetry, full_resolution, merge)
     files = all_files(asked, folder)
+    refuse_own_result(files, out)
     if asked.project.full_resolution:
         refuse_full_disk(files, out)
     _say_if_cold(progress)

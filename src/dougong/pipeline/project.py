@@ -17,6 +17,9 @@ from dougong.pipeline.settings import suggestion, validated
 from dougong.registration import Register
 from dougong.typing import Kind
 
+_RESULT = ("merged.copc.laz", "clouds", "removed", "distances", "full")
+"""What holds clouds in the folder of a result."""
+
 
 class Head(Parameters):
     """The table ``[project]``."""
@@ -249,6 +252,25 @@ def all_files(project: Project, folder: Path) -> list[Path]:
             raise InputError(f"{names} one file, named twice. Name each file once.")
         kind_of(file)
     return list(known.values())
+
+
+def refuse_own_result(files: Sequence[Path], out: Path) -> None:
+    """Refuse inputs that an earlier run into the same folder wrote.
+
+    Raises
+    ------
+    InputError
+        A pattern found the result: its points would be in the next one twice, and again.
+    """
+    folder = out.resolve()
+    for file in files:
+        place = file.resolve()
+        if place.is_relative_to(folder) and place.relative_to(folder).parts[0] in _RESULT:
+            msg = (
+                f"{file} is part of the result in {out}, expected a cloud of the survey. Choose "
+                "another --out, or a pattern that leaves the result out."
+            )
+            raise InputError(msg)
 
 
 def from_files(lidar: Sequence[Path], photogrammetry: Sequence[Path]) -> Project:

@@ -142,18 +142,19 @@ def signs(sheet: Sheet, values: Values, is_told: NDArray[np.bool_]) -> str:
 def signed_scale(limit_m: float, lod_m: float, below: str, above: str) -> str:
     """Return the key of a signed map as SVG: ticks in millimetres, and what either end means."""
     below, above = str(escape(below)), str(escape(above))
-    width, height, left = 520, 74, 20
+    # Rows far enough apart for the larger letters of a narrow page.
+    width, height, left = 520, 94, 20
     steps = np.linspace(-limit_m, limit_m, 41)
     colours = signed_colours(steps, limit_m)
     colours[np.abs(steps) < lod_m] = UNTOLD
     wide = (width - 2 * left) / len(steps)
     boxes = "".join(
-        f'<rect x="{left + i * wide:.1f}" y="22" width="{wide + 0.6:.1f}" height="16" '
+        f'<rect x="{left + i * wide:.1f}" y="26" width="{wide + 0.6:.1f}" height="16" '
         f'fill="rgb({r},{g},{b})"/>'
         for i, (r, g, b) in enumerate(colours.tolist())
     )
     ticks = "".join(
-        f'<text x="{left + (0.5 + share / 2) * (width - 2 * left):.0f}" y="56" '
+        f'<text x="{left + (0.5 + share / 2) * (width - 2 * left):.0f}" y="62" '
         f'text-anchor="middle">{1000 * share * limit_m:+.3g}</text>'
         for share in (-1.0, -0.5, 0.5, 1.0)
     )
@@ -161,10 +162,10 @@ def signed_scale(limit_m: float, lod_m: float, below: str, above: str) -> str:
     return (
         f'<svg class="key" viewBox="0 0 {width} {height}" role="img" aria-label="colour key: '
         f'blue, minus, {below}; orange, plus, {above}; grey, not told">{boxes}{ticks}'
-        f'<text x="{middle}" y="56" text-anchor="middle">0 mm</text>'
-        f'<text x="{left}" y="14">− {below}</text>'
-        f'<text x="{width - left}" y="14" text-anchor="end">+ {above}</text>'
-        f'<text x="{middle}" y="72" text-anchor="middle">grey: below the level of detection</text>'
+        f'<text x="{middle}" y="62" text-anchor="middle">0 mm</text>'
+        f'<text x="{left}" y="18">− {below}</text>'
+        f'<text x="{width - left}" y="18" text-anchor="end">+ {above}</text>'
+        f'<text x="{middle}" y="86" text-anchor="middle">grey: below the level of detection</text>'
         "</svg>"
     )
 

@@ -139,7 +139,7 @@ def _cloud(cloud: Mapping[str, Any]) -> CloudRow:
 
 
 def flat(values: Any, path: str = "") -> list[tuple[str, str]]:
-    """Return nested parameters as (dotted name, value) rows."""
+    """Return nested parameters as (dotted name, value) rows, values as a project file has them."""
     if isinstance(values, Mapping):
         rows = []
         for key, value in values.items():
@@ -152,7 +152,11 @@ def flat(values: Any, path: str = "") -> list[tuple[str, str]]:
         return rows
     if values is None:
         return [(path, "not set")]
-    return [(path, ", ".join(map(str, values)) if isinstance(values, list) else str(values))]
+    if isinstance(values, bool):
+        return [(path, "true" if values else "false")]
+    if isinstance(values, list):
+        return [(path, ", ".join(map(str, values)) or "none")]
+    return [(path, str(values))]
 
 
 def _provenance(document: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:

@@ -1,12 +1,13 @@
 """From a result folder to one self-contained HTML page."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jinja2
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from dougong.errors import InputError
 from dougong.pipeline.outputs import write_text
@@ -113,8 +114,14 @@ def environment() -> jinja2.Environment:
     engine.filters["percent"] = lambda value: f"{100 * value:.2f} %"
     engine.filters["chart"] = _chart
     engine.filters["built"] = Markup
+    engine.filters["breakable"] = _breakable
     engine.filters["scores"] = lambda link: Markup(score_chart(link.hypotheses, link.margin))
     return engine
+
+
+def _breakable(name: str) -> Markup:
+    """Return a dotted name that may go on in the next line behind each of its parts."""
+    return Markup(re.sub(r"([._])", r"\1<wbr>", str(escape(name))))
 
 
 def _chart(link: Any) -> Markup:
