@@ -67,14 +67,16 @@ class ParameterTables(Written):
         module, _, attribute = where.partition(":")
         yield from self._set(getattr(importlib.import_module(module), attribute), name, None)
 
-    def _set(self, model: type[BaseModel], name: str, instance: Any) -> Iterator[str]:
+    def _set(
+        self, model: type[BaseModel], name: str, instance: Any, is_list: bool = False
+    ) -> Iterator[str]:
         plain, inner = [], []
         for key, field in model.model_fields.items():
             held = _model_in(field.annotation)
             default = getattr(instance, key) if instance is not None else field.get_default()
             (inner if held else plain).append((field.alias or key, field, held, default))
         if name:
-            yield f"**`[{name}]`**"
+            yield f"**`[[{name}]]`**" if is_list else f"**`[{name}]`**"
             yield ""
         yield inspect.cleandoc(model.__doc__ or "").split("\n\n")[0].replace("\n", " ")
         yield ""
@@ -84,10 +86,11 @@ class ParameterTables(Written):
                 for key, field, _, default in plain
             ]
             yield from table(("field", "type", "default", "meaning"), rows)
-        for key, _, held, default in inner:
+        for key, field, held, default in inner:
             assert held is not None
             value = default if isinstance(default, BaseModel) else None
-            yield from self._set(held, f"{name}.{key}" if name else key, value)
+            inside = f"{name}.{key}" if name else key
+            yield from self._set(held, inside, value, get_origin(field.annotation) is tuple)
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:

@@ -22,7 +22,7 @@ _RESULT = ("merged.copc.laz", "clouds", "removed", "distances", "full")
 
 
 class Head(Parameters):
-    """The table ``[project]``."""
+    """What the project is called, and whose frame its result has."""
 
     name: str = "dougong project"
     """Title of the report."""
@@ -34,10 +34,12 @@ class Head(Parameters):
 
 
 class Entry(Parameters):
-    """One ``[[cloud]]``."""
+    """One cloud, in as many tables as there are clouds."""
 
     name: Annotated[str, Field(min_length=1, pattern=r"^[^/\\\x00]+$")]
+    """What the cloud and its files in the result are called; each differs from the others."""
     kind: Kind
+    """The sensor, which decides the filters."""
     files: Annotated[tuple[str, ...], Field(min_length=1)]
     """Paths or patterns, relative to the project file."""
     crs: str | None = None
@@ -49,7 +51,7 @@ class Entry(Parameters):
 
 
 class Quality(Parameters):
-    """The table ``[quality]``."""
+    """What the result is measured against."""
 
     control: str | None = None
     """CSV of control and check points, relative to the project file."""
