@@ -11,7 +11,7 @@ from dougong.errors import InputError
 from dougong.evaluation.facade import FEATURE, NOISE_LABELS, SURFACE, bracketed_facade
 from dougong.filters import protective
 from dougong.filters.balls import BLUR
-from dougong.filters.concentration import concentration_note
+from dougong.filters.concentration import concentration_note, tally, together
 from dougong.filters.curvature_weighted import (
     CurvatureWeighted,
     curvature_weighted,
@@ -445,6 +445,24 @@ def test_removal_that_prefers_carving_is_said():
     assert "on fine geometry" in said
     assert "--mark" in said
     assert concentration_note(points[:0], unfair[:0], variation[:0], 0.05) is None
+
+
+def test_tallies_of_parts_are_that_of_the_whole():
+    rng = np.random.default_rng(2)
+    points, is_kept, bend = rng.normal(0, 3, (4000, 3)), rng.random(4000) > 0.2, rng.random(4000)
+    points[0] += 1e7
+    whole = tally(points, is_kept, bend, 0.05)
+    cut = [slice(0, 1), slice(1, 900), slice(900, None)]
+    parts = together([tally(points[c], is_kept[c], bend[c], 0.05) for c in cut])
+    cells, number = np.unique(np.floor(points / 0.3), axis=0, return_inverse=True)
+    held = np.bincount(number.reshape(-1)), np.bincount(number.reshape(-1)[is_kept], minlength=1)
+    for found in (whole, parts):
+        order = np.lexsort(found.cells.T[::-1])
+        np.testing.assert_array_equal(found.cells[order], cells)
+        np.testing.assert_array_equal(found.counts[order, 0], held[0])
+        assert found.counts[:, 1].sum() == held[1].sum() == is_kept.sum()
+    order, again = np.lexsort(whole.cells.T), np.lexsort(parts.cells.T)
+    np.testing.assert_array_equal(whole.counts[order], parts.counts[again])
 
 
 def test_the_default_does_not_prefer_the_carving_of_the_facade():

@@ -6,11 +6,13 @@ concentrates there takes the carving for noise, and nobody would see it in its t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong.filters.octree_voxel_grid import runs_of_cells
 from dougong.typing import Mask, Points, Values
 
 CELL_SPACINGS = 6.0
@@ -51,33 +53,31 @@ def concentration_note(
 class Tally(NamedTuple):
     """Some cells, and what was taken in each."""
 
-    cells: NDArray[np.int64]
-    """(m, 3), each once."""
+    cells: Points
+    """(m, 3) whole numbers of cells, each once."""
     counts: NDArray[np.int64]
     """(m, 3): points there were, points kept, steps of surface variation of the kept ones."""
-
-    def merged(self, other: Tally) -> Tally:
-        """Return both as one: parts of a cloud share cells."""
-        cells = np.concatenate([self.cells, other.cells])
-        counts = np.concatenate([self.counts, other.counts])
-        unique, place = np.unique(cells, axis=0, return_inverse=True)
-        total = np.zeros((len(unique), 3), np.int64)
-        np.add.at(total, place.reshape(-1), counts)
-        return Tally(unique, total)
 
 
 def tally(points: Points, is_kept: Mask, variation: Values, spacing_m: float) -> Tally:
     """Return the cells of a cloud, or of a part of one, and what was taken in them."""
-    cells = np.floor(points / (CELL_SPACINGS * spacing_m)).astype(np.int64)
-    order = np.lexsort(cells.T)
-    cells = cells[order]
-    is_first = np.ones(len(cells), np.bool_)
-    is_first[1:] = (cells[1:] != cells[:-1]).any(axis=1)
-    starts = np.flatnonzero(is_first)
-    kept = is_kept[order].astype(np.int64)
-    bends = np.rint(variation[order] * _STEPS).astype(np.int64) * kept
+    kept = is_kept.astype(np.int64)
+    bends = np.rint(variation * _STEPS).astype(np.int64) * kept
     counts = np.stack([np.ones_like(kept), kept, bends], axis=1)
-    return Tally(cells[starts], np.add.reduceat(counts, starts, axis=0))
+    return _summed(np.floor(points / (CELL_SPACINGS * spacing_m)), counts)
+
+
+def together(parts: Sequence[Tally]) -> Tally:
+    """Return the tallies of all parts of a cloud, at least one, as one: they may share cells."""
+    cells = np.concatenate([part.cells for part in parts])
+    return _summed(cells, np.concatenate([part.counts for part in parts]))
+
+
+def _summed(cells: Points, counts: NDArray[np.int64]) -> Tally:
+    """Return the cells, each once, and the sums of their counts (n, 3)."""
+    places, starts = runs_of_cells(cells, cells.min(axis=0), 1.0)
+    firsts = starts[:-1]
+    return Tally(cells[places[firsts]], np.add.reduceat(counts[places], firsts, axis=0))
 
 
 def note_of(found: Tally) -> str | None:

@@ -17,7 +17,7 @@ import numpy as np
 import dougong
 from dougong.filters.cloth_simulation import ClothSimulation, cloth_notes, guarded_cloth
 from dougong.filters.clutter import Clutter, clutter_notes
-from dougong.filters.concentration import note_of, tally
+from dougong.filters.concentration import note_of, tally, together
 from dougong.filters.curvature_weighted import CurvatureWeighted
 from dougong.filters.low_outliers import LowOutliers, find_levels, low_notes
 from dougong.filters.pass_through import PassThrough, robust_top_of, unknown_notes
@@ -307,16 +307,15 @@ def _concentration(stage: _Stage, tested: str, key: str) -> str | None:
     spacing_m = median(stage.values(tested, "spacing"))
     if not spacing_m > 0:
         return None
-    found = None
+    parts = []
     for tile, points in zip(stage.cloud.tiles, stage.blocks(), strict=True):
         if not len(points):
             continue
         code = read_arrays(stage.cloud.folder, tile, key, "code")["code"]
         is_kept = code[stage.mask(tile)] == Reason.KEPT
         curvature = read_arrays(stage.cloud.folder, tile, tested, "curvature")["curvature"]
-        part = tally(points, is_kept, curvature, spacing_m)
-        found = part if found is None else found.merged(part)
-    return None if found is None else note_of(found)
+        parts.append(tally(points, is_kept, curvature, spacing_m))
+    return note_of(together(parts)) if parts else None
 
 
 _RUN: dict[str, Callable[[_Stage], Outcome]] = {
