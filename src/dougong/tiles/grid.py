@@ -65,11 +65,14 @@ def part(points: Points, grid: TileGrid) -> Parts:
     ]
     keys = _keys(columns)
     order = np.argsort(keys, kind="stable") if keys is not None else np.lexsort(columns[::-1])
-    ordered = np.stack([column[order] for column in columns])
-    is_first = np.ones(len(points), np.bool_)
-    is_first[1:] = np.logical_or.reduce(ordered[:, 1:] != ordered[:, :-1])
+    is_first = np.zeros(len(points), np.bool_)
+    is_first[:1] = True
+    for values in columns if keys is None else (keys,):
+        ordered = values[order]
+        is_first[1:] |= ordered[1:] != ordered[:-1]
     starts = np.flatnonzero(is_first)
-    return Parts(order, np.append(starts, len(points)), np.ascontiguousarray(ordered[:, starts].T))
+    tiles = np.column_stack([column[order[starts]] for column in columns])
+    return Parts(order, np.append(starts, len(points)), tiles)
 
 
 def _keys(columns: list[NDArray[np.int64]]) -> NDArray[Any] | None:

@@ -36,7 +36,10 @@ class Rows(NamedTuple):
 
     def take(self, chosen: Any) -> "Rows":
         """Return the `chosen` of them: a mask or places."""
-        return Rows(self.row[chosen], self.xyz[chosen], chosen_rows(self.records, chosen))
+        places = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
+        # Twice as fast as brackets where a row has several columns.
+        xyz = np.take(self.xyz, places, axis=0)
+        return Rows(self.row[places], xyz, chosen_rows(self.records, places))
 
 
 class RowFile:
