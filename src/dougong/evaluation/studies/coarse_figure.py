@@ -9,6 +9,8 @@ import numpy as np
 from dougong.evaluation.tabulate import chosen, distinct, new_figure, numbers
 
 Rows = Sequence[Mapping[str, Any]]
+_DOTS = {"ms": 3, "ls": "-"}
+_RINGS = {"ms": 8, "mfc": "none", "ls": "--"}
 
 
 def draw_coarse(rows: Rows, table: Rows, path: Path) -> None:
@@ -49,7 +51,8 @@ def draw_rates(panel: Any, table: Rows, by: tuple[str, ...] = ("on",)) -> None:
     panel.tick_params(labelsize=8)
     panel.set_ylim(0, 105)
     panel.set_ylabel("best pose is correct after the fine fit, percent", fontsize=9)
-    beside(panel, 3)
+    if len(groups) > 1:
+        beside(panel, 3)
 
 
 def _draw_iterations(panel: Any, rows: Rows) -> None:
@@ -73,14 +76,15 @@ def _draw_samples(panel: Any, rows: Rows) -> None:
     for (method,) in distinct(rows, "method"):
         line = chosen(rows, method=method)
         counts = [count for (count,) in distinct(line, "samples")]
-        for key, style in (("is_first_right", "-"), ("is_listed", "--")):
+        # Often the two coincide: rings round the dots, and both are seen.
+        for key, style in (("is_first_right", _DOTS), ("is_listed", _RINGS)):
             shares = [
                 100.0 * float(np.mean([row[key] for row in chosen(line, samples=count)]))
                 for count in counts
             ]
             label = f"{method}, {'first pose' if key == 'is_first_right' else 'one of eight'}"
             colour = "C3" if method == "sac-ia" else "C4"
-            panel.plot(counts, shares, f"o{style}", ms=3, color=colour, label=label)
+            panel.plot(counts, shares, marker="o", color=colour, label=label, **style)
     panel.set_xscale("log")
     panel.set_ylim(-3, 103)
     panel.set_xlabel("samples drawn (SAC-IA) or bases (4PCS)", fontsize=9)

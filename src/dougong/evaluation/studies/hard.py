@@ -132,7 +132,7 @@ def draw_verdicts(table: Sequence[Mapping[str, Any]], path: Path) -> None:
         share = [100.0 * row[verdict.lower()] / max(row["pairs"], 1) for row in table]
         panel.barh(names, share, left=left, color=COLOURS[verdict], label=verdict)
         left = [a + b for a, b in zip(left, share, strict=True)]
-    panel.invert_yaxis()
+    panel.set_ylim(len(set(names)) - 0.5, -0.5)
     panel.set_xlim(0, 100)
     panel.tick_params(labelsize=8)
     panel.set_xlabel("percent of the pairs; in brackets the answer the case must get", fontsize=9)
