@@ -230,6 +230,13 @@ def test_a_name_that_the_terminal_cannot_show_is_printed_all_the_same(tmp_path):
     assert b"\\u4e09.xyz" in found.stdout
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="a POSIX pipe")
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe.ply")
+    assert call(["info", str(tmp_path / "pipe.ply"), "--quiet"]) == 1
+    assert "is a pipe or a device, expected a file on a disk" in capsys.readouterr().err
+
+
 def test_commands_are_listed_in_the_order_of_a_survey(capsys):
     assert call(["--help"]) == 0
     said = capsys.readouterr().out

@@ -31,10 +31,14 @@ def opened(path: Path) -> Iterator[IO[bytes]]:
     Raises
     ------
     FormatError
-        Missing, a folder, not permitted, or empty.
+        Missing, a folder, a pipe or device, not permitted, or empty.
     """
     if path.is_dir():
         raise FormatError(f"{path} is a folder, expected a point cloud file. Name a file in it.")
+    if path.exists() and not path.is_file():
+        # A pipe can be read once and from its beginning only; opening one may wait for ever.
+        msg = f"{path} is a pipe or a device, expected a file on a disk. Write it to one first."
+        raise FormatError(msg)
     try:
         file = path.open("rb")
     except FileNotFoundError:

@@ -127,10 +127,6 @@ class ReducedClouds:
             self._held[name] = self._movers[name].reduced(self._most)
         return self._held[name]
 
-    def forget(self) -> None:
-        """Let go of the clouds."""
-        self._held.clear()
-
 
 def bare(cloud: Cloud, frame: Frame, name: str) -> Cloud:
     """Return the coordinates of a cloud in `frame`, which has its system."""
