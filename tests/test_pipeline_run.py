@@ -276,7 +276,7 @@ def test_a_failing_job_leaves_nothing(folder, capsys, monkeypatch):
         (("--lidar", "gone.laz"), "there is no file"),
         ((), "no cloud is named"),
         (("project.toml", "--lidar", "one.laz"), "Pass one or the other"),
-        (("--lidar", "one.laz", "--photogrammetry", "one.laz"), "one.laz is named twice"),
+        (("--lidar", "one.laz", "--photogrammetry", "one.laz"), "one.laz is one file, named twice"),
         (("--lidar", "one.laz", "--memory", "200MB"), "more than --memory"),
     ],
 )

@@ -289,14 +289,17 @@ def from_files(lidar: Sequence[Path], photogrammetry: Sequence[Path]) -> Project
         msg = "no cloud is named. Pass a project file, or --lidar FILE and --photogrammetry FILE."
         raise InputError(msg)
     names: dict[str, Path] = {}
+    known: dict[Path, Path] = {}
     for _, path in kinds:
         if not is_text(path):
             raise InputError(f"the name of {path} is no UTF-8 text. Rename it.")
+        one = known.setdefault(path.resolve(), path)
+        if one is not path:
+            both = f"{path} is" if one == path else f"{one} and {path} are"
+            raise InputError(f"{both} one file, named twice. Name each file once.")
         before = names.setdefault(stem(path), path)
         if before is path:
             continue
-        if before.resolve() == path.resolve():
-            raise InputError(f"{path} is named twice. Name each file once.")
         msg = (
             f"{before} and {path} would both be the cloud {stem(path)!r}: a cloud is called as its "
             "file is. Rename one, or write a project file (`dougong init DIR`)."
