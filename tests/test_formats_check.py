@@ -1,5 +1,6 @@
 """`check` finds each fault by name and stays silent about sound clouds; `describe` tells all."""
 
+import re
 import struct
 
 import laspy
@@ -144,6 +145,22 @@ def test_a_header_without_a_usable_box_is_said_and_harms_nothing(tmp_path, box):
     moved = tmp_path / "moved.las"
     reissue(path, moved, [np.eye(4)], Frame())
     assert describe(moved).extent_min == pytest.approx(hall().min(axis=0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("crs", "place", "said"),
+    [
+        ("EPSG:4326", [116.39, 39.9, 44.0], r"is in degrees \(WGS 84\).* UTM zone 50N"),
+        ("EPSG:3857", [12_956_000.0, 4_852_000.0, 44.0], "lengths depend on their direction"),
+    ],
+)
+def test_a_system_is_judged_by_the_points_whatever_the_header_states(tmp_path, crs, place, said):
+    path = saved(tmp_path, place + np.random.default_rng(0).uniform(0, 1e-3, (500, 3)), crs=crs)
+    raw = bytearray(path.read_bytes())
+    for box in ([np.nan] * 6, [0.0] * 6):
+        struct.pack_into("<6d", raw, 179, *box)
+        path.write_bytes(raw)
+        assert any(re.search(said, text) for text in texts(path, "error"))
 
 
 def test_points_outside_the_box_of_the_header_are_said(tmp_path):

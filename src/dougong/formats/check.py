@@ -90,7 +90,7 @@ def check(path: Path | str) -> list[Finding]:
     except FormatError as error:
         return [Finding("error", str(error))]
     findings = [
-        *_of_frame(info),
+        *_of_frame(info, tally),
         *_of_step(info, tally),
         *_of_box(info, tally),
         *_of_points(path, info, tally),
@@ -106,7 +106,7 @@ def _pass(path: Path, info: FileInfo) -> _Tally:
     return tally
 
 
-def _of_frame(info: FileInfo) -> list[Finding]:
+def _of_frame(info: FileInfo, tally: _Tally) -> list[Finding]:
     name = info.path.name
     if info.crs_wkt is None:
         text = (
@@ -114,10 +114,10 @@ def _of_frame(info: FileInfo) -> list[Finding]:
             "That is right for a scanner's own coordinates; otherwise export it with one."
         )
         return [Finding("warning", text)]
-    problem = metric_problem(info.crs_wkt, info.extent_min, info.extent_max, name)
-    if problem is None and info.extent_min is not None and info.extent_max is not None:
-        middle = (np.array(info.extent_min) + np.array(info.extent_max)) / 2
-        problem = projection_problem(info.crs_wkt, middle, name)
+    # Of the points, since a header's box may be stale, and one stray would move the middle of both.
+    middle = tally.frame.to_file(np.median(np.concatenate(tally.samples), axis=0)[None])[0]
+    problem = metric_problem(info.crs_wkt, middle, middle, name)
+    problem = problem or projection_problem(info.crs_wkt, middle, name)
     if problem:
         return [Finding("error", problem)]
     if info.unit_m != (1.0, 1.0, 1.0):

@@ -306,13 +306,18 @@ def _middle(info: FileInfo) -> Values:
     return middle
 
 
+def _shown_name(item: Item) -> str:
+    """Return what a person calls the points of an item."""
+    return item.path.name if item.removed_of is None else f"what was {item.name}"
+
+
 def _streamable(item: Item, scratch: Path, index: int, say: Note, notes: list[str]) -> Path:
     """Return the path of a COPC file with these points."""
     path = item.path
     info = describe(path)
     if info.format == "COPC":
         return path
-    say(f"converting {path.name} ({info.format}, {info.points:,} points) to COPC")
+    say(f"converting {_shown_name(item)} ({info.format}, {info.points:,} points) to COPC")
     converted = scratch / f"{index}.copc.laz"
     written = write(read(path), converted)
     if item.removed_of is not None:
