@@ -126,7 +126,7 @@ def scaling_for(
         msg = (
             f"{name} spans {high[axis] - low[axis]:.6g} units along {'xyz'[axis]}, and LAS holds "
             f"{2**32 * scale[axis]:.6g} at its step of {scale[axis]:g}. "
-            "Remove far points first (dougong check finds them), or write PLY."
+            "Crop far points off (`dougong check` counts them; pass_through.x_m), or write PLY."
         )
         raise OutputError(msg)
     return scale, offset
@@ -153,7 +153,7 @@ def set_integers(
             msg = (
                 f"a {'xyz'[axis]} of {coordinates[np.abs(steps).argmax(), axis]:.6g} does not fit "
                 f"LAS at a step of {scale[axis]:g} about {offset[axis]:g}. "
-                "Remove far points first (dougong check finds them), or write PLY."
+                "Crop far points off (`dougong check` counts them; pass_through.x_m), or write PLY."
             )
             raise OutsideLattice(msg)
         records[name] = steps
