@@ -1,6 +1,7 @@
 """Reference systems through every writer, and axes that were swapped or turned round."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -108,7 +109,7 @@ def test_check_names_swapped_axes(tmp_path):
     dougong.write(on_map("a", SWAPPED, "EPSG:32650"), tmp_path / "swapped.laz")
     worst = check(tmp_path / "swapped.laz")[0]
     assert worst.severity == "error"
-    assert "x = 4000015 is a northing" in worst.text
+    assert re.search(r"x = 40000\d\d is a northing", worst.text)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from cyclopts import Parameter
+from cyclopts import Parameter, validators
 
 from dougong import app
 from dougong.cli import _text
@@ -29,7 +29,9 @@ def command(
     pairs: Path | None = None,
     control: Path | None = None,
     grid_scale: str = "auto",
-    least_overlap: float | None = None,
+    least_overlap: Annotated[
+        float | None, Parameter(validator=validators.Number(gte=0, lte=1))
+    ] = None,
     source_crs: str | None = None,
     target_crs: str | None = None,
     accept_best: Annotated[bool, Parameter(negative="", show_default=False)] = False,
