@@ -1,6 +1,6 @@
 """A site of any number of points, and what filtering it takes: time and memory of all processes.
 
-    python benchmarks/large_site.py make FOLDER --points 1e7
+    python benchmarks/large_site.py make FOLDER --points 1e7 [--strays 0.1]
     python benchmarks/large_site.py filter FOLDER --memory 2GB [--json FILE]
     python benchmarks/large_site.py run FOLDER --memory 4GB [--voxel 0.06] [--json FILE]
 
@@ -22,6 +22,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -76,15 +77,15 @@ def yard(rng: np.random.Generator, count: int, *, is_scan: bool) -> np.ndarray:
     return np.column_stack([plan, 0.3 * np.sin(plan[:, 0] / 15.0)])
 
 
-def pieces(points: int, *, is_scan: bool) -> Iterator[Cloud]:
-    """Yield a cloud of so many points, the same at every call."""
+def pieces(points: int, strays: float, *, is_scan: bool) -> Iterator[Cloud]:
+    """Yield a cloud of so many points, the same at every call, `strays` of them off everything."""
     for number, start in enumerate(range(0, points, PIECE)):
         rng = np.random.default_rng([int(is_scan), number])
         count = min(PIECE, points - start)
         ground = yard(rng, count * 2 // 5, is_scan=is_scan)
         xyz = np.vstack([ground, walls_and_roofs(rng, count - len(ground))])
         xyz += rng.normal(0.0, 0.002 if is_scan else 0.015, xyz.shape)
-        stray = rng.random(count) < 2e-4
+        stray = rng.random(count) < strays
         xyz[stray] += rng.normal(0.0, 2.0, (int(stray.sum()), 3))
         yield Cloud.from_points(
             np.round(np.vstack([np.zeros(3), xyz]) + ORIGIN, 3),
@@ -92,20 +93,20 @@ def pieces(points: int, *, is_scan: bool) -> Iterator[Cloud]:
         ).select(np.arange(1, count + 1))
 
 
-def make(folder: Path, points: int) -> None:
+def make(folder: Path, points: int, strays: float) -> None:
     """Write the two clouds."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, share in (("scan", 0.85), ("drone", 0.15)):
         count = int(points * share)
-        source = lambda count=count, name=name: one_frame(count, is_scan=name == "scan")  # noqa: E731
+        source = partial(one_frame, count, strays, is_scan=name == "scan")
         written = write(source, folder / f"{name}.laz", overwrite=True)
         print(f"{written.path}: {written.points:,} points, {written.bytes / 1e6:.0f} MB")
 
 
-def one_frame(points: int, *, is_scan: bool) -> Iterator[Cloud]:
+def one_frame(points: int, strays: float, *, is_scan: bool) -> Iterator[Cloud]:
     """Yield the pieces in the frame of the first one."""
     first = None
-    for piece in pieces(points, is_scan=is_scan):
+    for piece in pieces(points, strays, is_scan=is_scan):
         first = first or piece
         yield piece if piece is first else piece.rebased(first.frame.origin)
 
@@ -211,12 +212,13 @@ def main() -> None:
     parser.add_argument("verb", choices=["make", "filter", "run"])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--points", type=float, default=1e7)
+    parser.add_argument("--strays", type=float, default=2e-4, help="share of stray points")
     parser.add_argument("--memory", default="2GB")
     parser.add_argument("--voxel", type=float, default=0.005)
     parser.add_argument("--json", type=Path, help="JSON lines: a line is added")
     asked = parser.parse_args()
     if asked.verb == "make":
-        make(asked.folder, int(asked.points))
+        make(asked.folder, int(asked.points), asked.strays)
         return
     measured = work(asked.folder, asked.verb, asked.memory, asked.voxel)
     if asked.json:

@@ -12,7 +12,7 @@ from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
 from dougong.filters.radius import Radius
 from dougong.filters.selection import Reason, details_of
 from dougong.tiles import nearest, work
-from dougong.tiles.cloud import load_tiles, read_arrays
+from dougong.tiles.cloud import load_tiles, read_arrays, read_file
 from dougong.tiles.engine import Task, local_engine
 from dougong.tiles.folder import LocalFolder
 from dougong.tiles.partition import partition
@@ -143,6 +143,23 @@ def test_things_across_tiles_are_judged_as_wholes(tmp_path, points, reach_m, mos
         np.testing.assert_array_equal(found[detail], wanted)
     np.testing.assert_array_equal(found["code"] == Reason.KEPT, expected.is_kept)
     assert notes == expected.notes
+
+
+def test_noise_stays_in_its_tiles(tmp_path):
+    rng = np.random.default_rng(6)
+    ground = np.column_stack([rng.uniform(0, 30, (20_000, 2)), 0.01 * rng.normal(size=20_000)])
+    points = np.vstack([ground, rng.uniform([0, 0, -9], [30, 30, 9], (4000, 3))])
+    cloud, _ = tiled(points, tmp_path, 1000)
+    with local_engine() as engine:
+        done = TileBench(cloud, engine).apply(
+            "curvature_weighted", FILTERS["curvature_weighted"].params()
+        )
+    assert done.taken > 3000
+    wholes = [name for name in cloud.folder.names() if name.startswith("whole.")]
+    held = [values for name in wholes for values in read_file(cloud.folder, name).values()]
+    # What is put together for the whole cloud follows its things and borders, not its noise.
+    assert len(wholes) == 3
+    assert max(len(np.atleast_1d(values)) for values in held) < done.taken / 10
 
 
 def test_a_tile_of_few_points_does_not_read_the_site(tmp_path, monkeypatch):

@@ -60,6 +60,12 @@ class Sizes(NamedTuple):
         size: Values = np.maximum(usual * np.sqrt(self.held), self.longest_m)
         return size
 
+    @property
+    def gap_m(self) -> Values:
+        """(g,) no farther than this is another piece of the same thing."""
+        gap: Values = BETWEEN * self.size_m
+        return gap
+
     def are_large(self, reach_m: float) -> Mask:
         """Say which groups (g,) are large."""
         # One place held many times over shows no surface.
@@ -119,23 +125,38 @@ def joined(count: int, one: Index, other: Index) -> Index:
     return into
 
 
+def are_pieces(sizes: Sizes, is_large: Mask) -> Mask:
+    """Say which groups (g,) are pieces of something."""
+    return (sizes.held > PIECE) & ~is_large
+
+
+def piece_links(points: Points, group: Index, gap_m: Values) -> Index:
+    """Return the pairs of groups (k, 2) whose pieces come near enough to be of one thing.
+
+    points (m, 3) of pieces, the group (m,) that each is in and the widest gap (m,) from its piece
+    to another. Of a part of a cloud: of all pairs, the links of some chain.
+    """
+    from dougong.filters.neighbourhood import build_index
+    from dougong.kernels import clusters as kernels
+
+    if not len(points):
+        return np.zeros((0, 2), np.int64)
+    tree = build_index(points)
+    mine, gap = group[tree.order], gap_m[tree.order]
+    _, first, number = np.unique(mine, return_index=True, return_inverse=True)
+    together = first[number]
+    kernels.link_within(tree.points, tree.boxes, gap, float(gap.min()), together)
+    is_new = mine != mine[together]
+    pairs: Index = np.unique(np.column_stack([mine, mine[together]])[is_new], axis=0)
+    return pairs
+
+
 def pieces_joined(points: Points, group: Index, sizes: Sizes, is_large: Mask) -> Index:
     """Return what each group becomes a part of (g,) when pieces of one thing become one.
 
     points (m, 3) and their group (m,) hold those of all groups that are not large, at least.
     """
-    from dougong.filters.neighbourhood import build_index
-    from dougong.kernels import clusters as kernels
-
-    count = len(sizes.held)
-    is_piece = (sizes.held > PIECE) & ~is_large
-    if np.count_nonzero(is_piece) < 2:
-        return np.arange(count)
-    chosen = np.flatnonzero(is_piece[group])
-    tree = build_index(points[chosen])
-    mine = group[chosen[tree.order]]
-    gap = BETWEEN * sizes.size_m[mine]
-    _, first, number = np.unique(mine, return_index=True, return_inverse=True)
-    together = first[number]
-    kernels.link_within(tree.points, tree.boxes, gap, float(gap.min()), together)
-    return joined(count, mine, mine[together])
+    chosen = np.flatnonzero(are_pieces(sizes, is_large)[group])
+    mine = group[chosen]
+    pairs = piece_links(points[chosen], mine, sizes.gap_m[mine])
+    return joined(len(sizes.held), pairs[:, 0], pairs[:, 1])

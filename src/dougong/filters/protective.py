@@ -6,8 +6,7 @@ line it lies on, and counts a little more across a plane; the first to eighth ne
 together, so that pairs do not vouch for each other (`surroundings`); groups that are smaller than
 their distance from everything large go (`groups`); rows that chance does not make stay.
 
-Only the surroundings are asked of every point. What comes behind them concerns the few that are in
-doubt, so of a cloud in parts it is settled for all of them at once.
+Only the surroundings are asked of every point; what comes behind them concerns those in doubt.
 Kernels are imported when called.
 """
 
@@ -42,7 +41,6 @@ ROW_NEIGHBOURS, ROW_WIDTH, ROW_ACCIDENTS = 24, 0.5, 1e-3
 either side) has so many that chance would make fewer than this number of such rows there."""
 ROW_REACH = 0.1
 """In rows the spacing counts as at most this many reaches."""
-_BLOCK = 1 << 13
 
 
 class Verdict(NamedTuple):
@@ -72,14 +70,14 @@ class Doubtful(NamedTuple):
 
 
 class Things(NamedTuple):
-    """The groups of a whole cloud, pieces of one thing joined."""
+    """The t things of a whole cloud: its groups, pieces of one thing joined."""
 
-    into: Index
-    """(g,) the number of the thing that each group is a part of."""
     are_large: Mask
-    """(t,) of each thing."""
+    """(t,)."""
     size_m: Values
     """(t,)."""
+    large_from: int
+    """Where nothing is large, so many points make a thing that is; else 0."""
 
 
 def halo_m(reach_m: float | None) -> float:
@@ -117,12 +115,16 @@ def judge(points: ArrayLike, tests: Tests, reach_m: float | None = None) -> Verd
     sizes = sizes_of(xyz, tested.spacing_m, tested.curvature, tested.group)
     places = doubtful_of(tested, sizes.are_large(reach))
     few = doubtful(xyz, tested, places)
-    things = things_of(few, sizes, reach, is_whole=reach_m is None)
-    is_large = things.are_large[things.into]
-    hovers = ~is_large[few.group]
-    chosen = is_large[tested.group[index.order]]
-    gap_m = distance_to(index, chosen, few.points[hovers], GROUP * reach)
-    margin[places], reason[places] = settle(few, things, gap_m, reach)
+    into = pieces_joined(few.points, few.group, sizes, sizes.are_large(reach))
+    things = things_of(sizes.merged(into), reach, 0 if reach_m is None else None)
+    chosen = things.are_large[into[tested.group[index.order]]]
+    thing = into[few.group]
+    hovers = np.flatnonzero(~things.are_large[thing])
+    gap_m = np.where(things.are_large, 0.0, np.inf)
+    found_m = distance_to(index, chosen, few.points[hovers], GROUP * reach)
+    np.minimum.at(gap_m, thing[hovers], found_m)
+    few = hovering(few, gap_m[thing], things.size_m[thing])
+    margin[places], reason[places] = rows_excused(few, len(places), reach), few.reason
     reason[margin <= 1.0] = Taken.KEPT
     return Verdict(margin, reason, tested.spacing_m, tested.curvature)
 
@@ -148,75 +150,74 @@ def doubtful(points: Points, tested: Tested, places: Index) -> Doubtful:
     )
 
 
-def things_of(few: Doubtful, sizes: Sizes, reach_m: float, *, is_whole: bool) -> Things:
-    """Return what the groups of a whole cloud are parts of.
+def things_of(sizes: Sizes, reach_m: float, most_beside: int | None = None) -> Things:
+    """Return which things of a whole cloud are large.
 
     Parameters
     ----------
-    few : Doubtful
-        All points that may go.
     sizes : Sizes
-        Of the groups.
+        Of the things.
     reach_m : float
-    is_whole : bool
-        Where nothing is large, what has most points counts as large: a small thing alone is what
-        was scanned.
+    most_beside : int, optional
+        If given, and nothing is large, what has most points counts as large: a small thing alone
+        is what was scanned. There are others beside these, none large, of at most so many points.
     """
-    into = pieces_joined(few.points, few.group, sizes, sizes.are_large(reach_m))
-    things = sizes.merged(into)
-    are_large = things.are_large(reach_m)
-    if is_whole and len(are_large) and not are_large.any():
-        are_large = things.held == things.held.max()
-    return Things(into, are_large, things.size_m)
+    are_large = sizes.are_large(reach_m)
+    large_from = 0
+    if most_beside is not None and not are_large.any():
+        large_from = max(int(sizes.held.max(initial=0)), most_beside)
+        are_large = sizes.held == large_from
+    return Things(are_large, sizes.size_m, large_from)
 
 
-def settle(
-    few: Doubtful, things: Things, gap_m: Values, reach_m: float
-) -> tuple[Values, NDArray[np.uint8]]:
-    """Return the margin (m,) and the reason (m,) of the points that may go.
+def hovering(few: Doubtful, gap_m: Values, size_m: Values) -> Doubtful:
+    """Return the points in doubt after groups were judged by what lies between them and the rest.
 
-    gap_m (h,): from those whose thing is not large, in their order, to the nearest point of a large
-    one; at most `GROUP` reaches.
+    gap_m (m,): from each one's thing to the nearest large one, at most `GROUP` reaches; 0 for large
+    things. size_m (m,) of each one's thing.
     """
-    margin, reason = few.margin.copy(), few.reason.copy()
-    thing = things.into[few.group]
-    hovers = np.flatnonzero(~things.are_large[thing])
-    gap = np.full(len(things.size_m), np.inf)
-    np.minimum.at(gap, thing[hovers], gap_m)
-    lonely = gap[thing[hovers]] / things.size_m[thing[hovers]]
-    is_worse = lonely > margin[hovers]
+    lonely = gap_m / size_m
+    is_worse = lonely > few.margin
     # A point alone is alone whatever else.
-    is_named = is_worse & (reason[hovers] != Taken.ALONE)
-    margin[hovers[is_worse]] = lonely[is_worse]
-    reason[hovers[is_named]] = Taken.SMALL_GROUP
-    _excuse_rows(few.points, few.spacing_m, reach_m, margin)
-    return margin, reason
+    is_named = is_worse & (few.reason != Taken.ALONE)
+    return few._replace(
+        margin=np.where(is_worse, lonely, few.margin),
+        reason=np.where(is_named, np.uint8(Taken.SMALL_GROUP), few.reason),
+    )
 
 
-def _excuse_rows(points: Points, spacing: Values, reach: float, margin: Values) -> None:
-    """Lower the margin (n,) of points that would go but lie in a row with others that would.
+def rows_excused(few: Doubtful, own: int, reach_m: float) -> Values:
+    """Return the margin (own,) of the first points, lower where they lie in rows.
 
-    A wire that a scan met in a few places is nothing to its neighbours, and chance makes no rows.
+    A wire that a scan met in a few places is nothing to its neighbours, and chance makes no rows:
+    those count that would go, as others do within `row_halo_m`.
     """
-    from dougong.filters.neighbourhood import build_index, knn
+    from dougong.filters.neighbourhood import build_index, leaves_of, self_knn_block
     from dougong.kernels import protective as kernels
 
-    chosen = np.flatnonzero(margin > 1.0)
-    if not len(chosen):
-        return
-    points = points[chosen]
-    places = knn(build_index(points), None, ROW_NEIGHBOURS, GROUP * reach)[0].astype(np.int32)
+    chosen = np.flatnonzero(few.margin > 1.0)
+    margin = few.margin[:own].copy()
+    index = build_index(few.points[chosen])
+    place = chosen[index.order]
     # Where next to nothing is in reach, the spacing says so little that a row would be a road.
-    usual = np.minimum(spacing[chosen], ROW_REACH * reach)
-    accident = np.zeros(len(chosen))
-    for_blocks(
-        len(chosen),
-        _BLOCK,
-        lambda start, stop: kernels.rows(
-            points, places, usual, ROW_WIDTH, GROUP * reach, start, stop, accident
-        ),
-    )
-    is_sure = accident < 0.0
-    excused = np.full(len(chosen), np.inf)
-    excused[is_sure] = math.log(ROW_ACCIDENTS) / accident[is_sure]
-    margin[chosen] = np.minimum(margin[chosen], excused)
+    usual = np.minimum(few.spacing_m[place], ROW_REACH * reach_m)
+    reach = row_halo_m(reach_m)
+    blocks = leaves_of(index, place < own)
+
+    def task(first: int, last: int) -> None:
+        for block in blocks[first:last]:
+            start, near, _ = self_knn_block(index, ROW_NEIGHBOURS, reach**2, *block)
+            accident = np.empty(len(near))
+            kernels.rows(index.points, near, usual, ROW_WIDTH, reach, start, accident)
+            mine = place[start : start + len(near)]
+            is_sure = (accident < 0.0) & (mine < own)
+            sure = mine[is_sure]
+            margin[sure] = np.minimum(margin[sure], math.log(ROW_ACCIDENTS) / accident[is_sure])
+
+    for_blocks(len(blocks), 1, task)
+    return margin
+
+
+def row_halo_m(reach_m: float) -> float:
+    """Return how far the points lie that make a row with one."""
+    return GROUP * reach_m

@@ -39,7 +39,7 @@ HALO = 1.0 + 2.0 * FAR_CELLS
 """Reaches that a part must know beyond its own points: those of a neighbour's spacing."""
 _FOUND = 2.0
 """Reaches in which the neighbours of the neighbours of a part's own points lie."""
-_SLACK = 1.0 + 1e-9
+SLACK = 1.0 + 1e-9
 """What rounding may do to a border, and more."""
 _BLOCK = 1 << 13
 
@@ -157,7 +157,7 @@ def test_part(points: Points, eighth_m: Values, own: int, reach_m: float, tests:
     if not own:
         return _nothing()
     low, high = corners_of(points[:own])
-    found = _FOUND * reach_m * _SLACK
+    found = _FOUND * reach_m * SLACK
     is_near = are_within(points, low - found, high + found)
     # What is farther has a say in the spacing only. Own points come first still.
     order = np.concatenate([np.flatnonzero(is_near), np.flatnonzero(~is_near)])
@@ -165,7 +165,7 @@ def test_part(points: Points, eighth_m: Values, own: int, reach_m: float, tests:
     shown = spacing_shown(eighth_m[order], reach_m)
     spacing = local_spacing(points[order], shown, reach_m, near)
     index = build_index(points[order[:near]])
-    reach = reach_m * _SLACK
+    reach = reach_m * SLACK
     is_seen = are_within(index.points, low - reach, high + reach)
     places, _ = _neighbours(index, reach_m, is_seen)
     tested = _tested(index, places, spacing[index.order], own, is_seen, reach_m, tests)

@@ -320,26 +320,27 @@ def _in_row(along: Floats, held: int, step: float) -> int:
 @kernel
 def rows(
     points: Floats,
-    places: Small,
+    places: Ints,
     spacing: Floats,
     width: float,
     reach: float,
     start: int,
-    stop: int,
     accident: Floats,
 ) -> None:
-    """Fill accident (n,): how many rows like the best through each point chance would make there.
+    """Fill accident (m,): how many rows like the best through each point chance would make there.
 
-    The logarithm. A row is a strip, `width` spacings to either side of a line through the point
-    and one of its places (n, k) int32; chance throws the others evenly on a disc of their reach.
+    The logarithm; of the points from `start` on. A row is a strip, `width` spacings to either side
+    of a line through the point and one of its places (m, k); chance throws the others evenly on a
+    disc of their reach.
     """
     along = np.empty(places.shape[1], np.float64)
-    for i in range(start, stop):
-        accident[i] = 0.0
+    for row in range(places.shape[0]):
+        i = start + row
+        accident[row] = 0.0
         held = 0
         far2 = 0.0
         for column in range(places.shape[1]):
-            j = places[i, column]
+            j = places[row, column]
             if j < 0:
                 break
             held += 1
@@ -354,7 +355,7 @@ def rows(
         if p >= 0.5:
             continue
         for column in range(held):
-            j = places[i, column]
+            j = places[row, column]
             ux = points[j, 0] - points[i, 0]
             uy = points[j, 1] - points[i, 1]
             uz = points[j, 2] - points[i, 2]
@@ -363,7 +364,7 @@ def rows(
                 continue
             count = 0
             for other in range(held):
-                k = places[i, other]
+                k = places[row, other]
                 x = points[k, 0] - points[i, 0]
                 y = points[k, 1] - points[i, 1]
                 z = points[k, 2] - points[i, 2]
@@ -373,7 +374,7 @@ def rows(
                     count += 1
             aligned = _in_row(along, count, half)
             log = math.log(held) + _log_tail(held - 1, aligned - 1, p)
-            accident[i] = min(accident[i], log)
+            accident[row] = min(accident[row], log)
 
 
 @kernel

@@ -30,7 +30,7 @@ from dougong.filters.surroundings import REACH_M, TESTS, reach_of
 from dougong.filters.totals import Totals
 from dougong.filters.wires import are_rows
 from dougong.params import Parameters
-from dougong.tiles import nearest, protective, work
+from dougong.tiles import nearest, protective, things, work
 from dougong.tiles.cloud import (
     Arrays,
     Record,
@@ -262,23 +262,32 @@ def _curvature_weighted(stage: _Stage) -> Outcome:
 
 
 def _protective(stage: _Stage, params: CurvatureWeighted) -> Outcome:
-    asked, is_whole = stage.asked, params.reach_m is None
+    asked = stage.asked
     reach, eighth = _reach(stage, params)
-    tiles, folder = stage.cloud.tiles, stage.cloud.folder
     _, tested = stage.map("surroundings", protective.test_points, (eighth, reach))
-    verdicts = None
+    judged = None
     if not is_too_few(asked, params.reach_m):
-        things, _ = stage.kept(
-            "things",
-            lambda _: (protective.things_of(folder, tiles, tested, reach, is_whole=is_whole), {}),
-        )
-        _, gaps = stage.map("gaps", protective.gaps, (tested, things, reach))
-        verdicts, _ = stage.kept(
-            "verdicts", lambda _: (protective.settled(folder, tiles, gaps, things, reach), {})
-        )
-    records, key = stage.map("curvature_weighted", protective.judge, (tested, verdicts))
+        judged = _hovering(stage, tested, reach, is_whole=params.reach_m is None)
+    records, key = stage.map("curvature_weighted", protective.judge, (tested, judged, reach))
     note = _concentration(stage, tested, key) if asked else None
     return records, () if note is None else (note,), key
+
+
+def _hovering(stage: _Stage, tested: str, reach: float, *, is_whole: bool) -> str:
+    """Return the step that judges the points in doubt by what they are parts of."""
+    cloud = (stage.cloud.folder, stage.cloud.tiles)
+    groups, record = stage.kept("groups", lambda _: things.open_groups(*cloud, tested, reach))
+    _, linked = stage.map("pieces", things.link_pieces, (tested, groups, reach))
+    most = record["most_beside"] if is_whole else None
+    file, _ = stage.kept(
+        "things", lambda _: (things.things_of(*cloud, groups, linked, reach, most), {})
+    )
+    _, measured = stage.map("gaps", things.gaps, (tested, file, reach))
+    gaps, _ = stage.kept(
+        "thing_gaps", lambda _: (things.gaps_of_things(*cloud, file, measured, reach), {})
+    )
+    known = (tested, measured, file, gaps, reach)
+    return stage.map("hovering", protective.hovering, known)[1]
 
 
 def _reach(stage: _Stage, params: CurvatureWeighted) -> tuple[float, str]:
