@@ -13,13 +13,15 @@ import pytest
 import dougong
 from dougong.cli import call
 from dougong.cloud import Cloud
+from dougong.errors import InputError
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid, root_cube
-from dougong.filters.selection import DETAIL
+from dougong.filters.protective import Taken
+from dougong.filters.selection import DETAIL, Reason
 from dougong.formats.model import Hold
+from dougong.pipeline import books as books_module
 from dougong.pipeline import memory, reduced
-from dougong.pipeline.movers import Tally
+from dougong.pipeline.books import Binder, Books
 from dougong.pipeline.result_hash import in_byte_order
-from dougong.pipeline.store import Books
 from dougong.registration.result import Registration
 from dougong.threads import get_threads, set_threads
 
@@ -30,7 +32,6 @@ SMALL = {
     "BYTES_PER_WAITING_POINT": 10,
     "BYTES_PER_REDUCED_POINT": 2,
     "LEAST_TILE_POINTS": 100,
-    "_BYTES_PER_BOOKED_POINT": 1,
     "_BYTES_PER_TILE_POINT": 40,
 }
 """Estimates by which 15,000 points do not fit in 190 kB, and tiles of them do."""
@@ -213,18 +214,55 @@ def test_a_killed_run_ends_as_one_left_alone(folder):
     assert left == {"calm", "killed", "scan.laz", "map.laz"}
 
 
-def test_counting_what_became_of_the_points_holds_few_bytes_of_each():
+def test_books_are_bound_in_the_order_of_the_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(books_module, "PAGE_POINTS", 1000)
+    rng, n = np.random.default_rng(0), 4321
+    codes, ground = rng.integers(2, 9, n, np.uint8), rng.integers(0, 3, n, np.uint8)
+    codes[rng.random(n) < 0.5] = Reason.KEPT
+    detail, tile = rng.integers(0, 5, n, np.uint8), rng.integers(0, 9, n)
+    # No tile has the points of two pages, nor those of tile 8: they were decimated.
+    tile[1000:3000] = 8
+    (tmp_path / "books").mkdir()
+    (tmp_path / "books" / "0.rows").write_bytes(b"of a killed run")
+    binder = Binder(tmp_path / "books", n)
+    for number in range(8):
+        row = np.flatnonzero(tile == number)
+        columns = {"codes": codes, "ground_class": ground, DETAIL: detail}
+        binder.add(row, {name: values[row] for name, values in columns.items()})
+    is_gone = tile == 8
+    codes[is_gone], ground[is_gone], detail[is_gone] = Reason.DECIMATED, 0, 0
+    books = Books(points=n, page=binder.page, page_points=1000, stages=(), notes=(), noticed=())
+    tally = books.tally()
+    assert list(tally.reasons.values()) == np.bincount(codes, minlength=len(Reason)).tolist()
+    assert tally.kept == int((codes == 0).sum())
+    assert tally.ground == int(((codes == 0) & (ground == 2)).sum())
+    assert tally.details["alone"] == int(((codes == 3) & (detail == Taken.ALONE)).sum())
+    cloud = Cloud.from_points(rng.random((n, 3)))
+    for ends in ([n], [1, 999, 1000, 2500, n]):
+        chunks = [cloud.select(np.arange(a, b)) for a, b in zip([0, *ends], ends, strict=False)]
+        parts = [part for _, part in books.along(chunks)]
+        np.testing.assert_array_equal(np.concatenate([p.codes for p in parts]), codes)
+        np.testing.assert_array_equal(np.concatenate([p.ground_class for p in parts]), ground)
+        np.testing.assert_array_equal(np.concatenate([p.details[DETAIL] for p in parts]), detail)
+        kept = np.concatenate([part.cloud.xyz for part in parts])
+        np.testing.assert_array_equal(kept, cloud.xyz[codes == 0])
+    for wrong in ([cloud.select(np.arange(n - 1))], [cloud, cloud.select(np.arange(1))]):
+        with pytest.raises(InputError, match="is of 4,321 points, the cloud has"):
+            list(books.along(wrong))
+
+
+def test_books_of_any_size_hold_a_page_at_a_time(tmp_path):
     rng, n = np.random.default_rng(0), 20_000_000
-    codes, ground = rng.integers(0, 9, n, np.uint8), rng.integers(0, 3, n, np.uint8)
-    details = {DETAIL: rng.integers(0, 5, n, np.uint8)}
-    books = Books(
-        codes=codes, ground_class=ground, stages=(), notes=(), noticed=(), details=details
-    )
+    binder = Binder(tmp_path, n)
+    for start in range(0, n, 1_000_000):
+        row = np.arange(start, start + 1_000_000)
+        columns = {"codes": rng.integers(0, 9, 1_000_000, np.uint8)}
+        columns |= dict.fromkeys(("ground_class", DETAIL), columns["codes"] % 3)
+        binder.add(row, columns)
+    books = Books(points=n, page=binder.page, stages=(), notes=(), noticed=())
     tracemalloc.start()
-    tally = Tally.of(books)
+    tally = books.tally()
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    # A mask and what it chooses, and a block of whole numbers.
-    assert peak < 2 * n + 50_000_000
-    assert list(tally.reasons.values()) == np.bincount(codes).tolist()
-    assert tally.ground == int(((codes == 0) & (ground == 2)).sum())
+    assert sum(tally.reasons.values()) == n
+    assert peak < 60_000_000

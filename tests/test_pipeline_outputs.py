@@ -132,6 +132,7 @@ def test_a_step_that_cannot_be_kept_is_one_sentence(tmp_path, monkeypatch):
     import numpy as np
 
     from dougong.cloud import Cloud
+    from dougong.pipeline.books import Books
     from dougong.pipeline.steps import Filtered
     from dougong.pipeline.store import Store
 
@@ -145,7 +146,7 @@ def test_a_step_that_cannot_be_kept_is_one_sentence(tmp_path, monkeypatch):
     step = Filtered(cloud=cloud, codes=codes, ground_class=codes, stages=())
     store = Store.beside(tmp_path / "out")
     with pytest.raises(OutputError, match=r"work could not be written: No space left.*--work"):
-        store.save("key", step, ())
+        store.save("key", Books.of(step, ()))
     assert list((tmp_path / "out.work").iterdir()) == []
 
 

@@ -15,7 +15,6 @@ LITTLE = {
     "BYTES_PER_POINT": 5,
     "BYTES_PER_WAITING_POINT": 1,
     "LEAST_TILE_POINTS": 100,
-    "_BYTES_PER_BOOKED_POINT": 2,
     "_BYTES_PER_TILE_POINT": 12,
 }
 """Estimates by which 190 kB are enough for tiles of some 3000 points and their halo."""
@@ -61,7 +60,7 @@ from dougong.pipeline import memory
 from dougong.tiles import engine
 
 memory.BASE_BYTES, memory.BYTES_PER_POINT, memory.LEAST_TILE_POINTS = 0, 5, 100
-memory._BYTES_PER_BOOKED_POINT, memory._BYTES_PER_TILE_POINT = 2, 12
+memory._BYTES_PER_TILE_POINT = 12
 left, perform = int(sys.argv[1]), engine.perform
 
 def counted(task):

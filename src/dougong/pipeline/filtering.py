@@ -11,6 +11,7 @@ from typing import Any
 import dougong
 from dougong.cloud import Cloud, Pieces
 from dougong.errors import InputError
+from dougong.filters.protective import Taken
 from dougong.filters.selection import Reason
 from dougong.formats import (
     describe,
@@ -20,6 +21,7 @@ from dougong.formats import (
 )
 from dougong.formats.model import Hold
 from dougong.params import Parameters
+from dougong.pipeline.books import Books, Tally
 from dougong.pipeline.marking import GROUND_CLASS, marked, marks_clutter, with_classes, with_clutter
 from dougong.pipeline.memory import Room
 from dougong.pipeline.outputs import refuse_output, watched, write_json
@@ -33,7 +35,6 @@ from dougong.pipeline.recipes import (
     steps_of,
 )
 from dougong.pipeline.registrations import finite
-from dougong.pipeline.removed import detail_counts, ground_kept, reason_counts
 from dougong.pipeline.settings import parse_overrides, updated
 from dougong.pipeline.single import (
     filter_name,
@@ -43,7 +44,6 @@ from dougong.pipeline.single import (
     single_steps,
 )
 from dougong.pipeline.steps import Filtered
-from dougong.pipeline.store import Books
 from dougong.pipeline.tiled import (
     TiledJob,
     filter_chunks,
@@ -136,8 +136,8 @@ def filter_file(
     FormatError, OutputError
         The input cannot be read, the output not written (a full disk).
     """
-    books = output.with_name(output.name + ".json")
-    refuse_output(input, output, [output, books], overwrite)
+    beside = output.with_name(output.name + ".json")
+    refuse_output(input, output, [output, beside], overwrite)
     clock = Clock()
     progress.stage(f"reading {input.name}")
     with clock.measure("read"):
@@ -146,37 +146,37 @@ def filter_file(
     with _places(output, work, f"{digest} {job.tiled().grid!r} in {room.bytes:.0f}") as places:
         result: Cloud | Pieces
         hold: Hold | None = None
-        filtered: Filtered | Books
+        books: Books
         if is_too_large(input, room, 0):
             progress.note(f"{input.name} is larger than memory: it is filtered on tiles")
             with clock.measure("filter"):
-                filtered = _filtered_on_tiles(input, job, room, places, progress)
-            noticed = filtered.noticed
-            hold = Hold(room.most_points_beside(len(filtered.codes)), output.parent)
-            result = _pieces(input, job, filtered, mark)
+                books = _filtered_on_tiles(input, job, room, places, progress)
+            hold = Hold(room.held_points(), output.parent)
+            result = _pieces(input, job, books, mark)
         else:
             with clock.measure("read"):
                 cloud = read(input)
                 noticed = (*cloud.notes, *faults_of(cloud))
             with clock.measure("filter"):
                 filtered = job.run(cloud, progress)
+            books = Books.of(filtered, noticed)
             result = _chosen(job, cloud, filtered, mark)
         progress.stage(f"writing {output.name}")
-        with watched(output, books):
+        with watched(output, beside):
             with clock.measure("write"):
                 written = write(result, output, overwrite=overwrite, hold=hold)
-            notes = [*noticed, *filtered.notes, *written.notes]
+            notes = [*books.noticed, *books.notes, *written.notes]
             document = {
-                "input": {"path": str(input), "sha256": digest, "points": len(filtered.codes)},
+                "input": {"path": str(input), "sha256": digest, "points": books.points},
                 "output": str(output),
-                **_filter_document(job, filtered, written.points, mark),
+                **_filter_document(job, books, written.points, mark),
                 "notes": notes,
                 "seconds": {**clock.seconds, "total": clock.total()},
                 "peak_memory_bytes": peak_memory_bytes(),
                 "software": software(),
             }
             cleaned: Document = finite(document)
-            write_json(books, cleaned)
+            write_json(beside, cleaned)
     return cleaned
 
 
@@ -205,30 +205,24 @@ def _pieces(input: Path, job: FilterJob, books: Books, mark: bool) -> Pieces:
     """Return what is written of a cloud that was filtered on tiles, as it is decoded again."""
 
     def pieces() -> Iterator[Cloud]:
-        done = 0
         (chunks,) = stations_of(input, split=False)
-        for chunk in chunks:
-            here = slice(done, done + len(chunk))
-            done += len(chunk)
-            yield _chosen(job, chunk, books.part(chunk, here), mark)
+        for chunk, part in books.along(chunks):
+            yield _chosen(job, chunk, part, mark)
 
     return pieces
 
 
-def _filter_document(
-    job: FilterJob, filtered: Filtered | Books, written: int, mark: bool
-) -> Document:
+def _filter_document(job: FilterJob, books: Books, written: int, mark: bool) -> Document:
     """Return what the books say of the filter: counts per stage, reasons, parameters."""
-    reasons = reason_table(filtered)
-    points_in, points_kept = len(filtered.codes), reasons.get("kept", {"points": 0})["points"]
+    tally = books.tally()
     return {
         "kind": job.kind,
         "only": job.only,
         "is_marked": mark,
-        "points_in": points_in,
-        "points_kept": points_kept,
+        "points_in": books.points,
+        "points_kept": tally.kept,
         "points_written": written,
-        "reduction": 1.0 - points_kept / points_in,
+        "reduction": 1.0 - tally.kept / books.points,
         "stages": [
             {
                 "name": stage.name,
@@ -238,10 +232,10 @@ def _filter_document(
                 "seconds": stage.seconds,
                 **({"found": dict(stage.found)} if stage.found else {}),
             }
-            for stage in filtered.stages
+            for stage in books.stages
         ],
-        "reasons": reasons,
-        "ground_points": ground_kept(filtered.codes, filtered.ground_class),
+        "reasons": reason_table(tally),
+        "ground_points": tally.ground,
         "parameters": job.params.model_dump(mode="json"),
     }
 
@@ -262,15 +256,19 @@ def _filtered_on_tiles(
     )
 
 
-def reason_table(filtered: Filtered | Books) -> dict[str, dict[str, Any]]:
+def reason_table(tally: Tally) -> dict[str, dict[str, Any]]:
     """Return per reason its code in ``dougong_reason`` and the points it took, in detail too."""
     table: dict[str, dict[str, Any]] = {}
-    for reason, points in zip(Reason, reason_counts(filtered.codes), strict=True):
+    for reason in Reason:
+        points = tally.reasons[reason.name.lower()]
         if not points:
             continue
         row: dict[str, Any] = {"code": int(reason), "points": points}
         if reason == Reason.CURVATURE_WEIGHTED:
-            row["details"] = detail_counts(filtered.codes, filtered.details)
+            row["details"] = {
+                name: {"code": int(Taken[name.upper()]), "points": count}
+                for name, count in tally.details.items()
+            }
         table[reason.name.lower()] = row
     return table
 

@@ -1,6 +1,7 @@
 """From a project's entries to the clouds that move: read, filtered, named."""
 
-from collections.abc import Callable, Iterable, Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,11 @@ from dougong.cloud import Cloud
 from dougong.formats import describe, faults_of, in_system, read, read_stations
 from dougong.formats.faults import NO_SYSTEM
 from dougong.formats.model import Hold
+from dougong.pipeline.books import Books
 from dougong.pipeline.kept import Kept
 from dougong.pipeline.marking import marks_clutter, with_clutter
-from dougong.pipeline.memory import LEAST_TILE_POINTS, Room
-from dougong.pipeline.movers import Mover, Source, Tally
+from dougong.pipeline.memory import Room
+from dougong.pipeline.movers import Mover, Source
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Entry, files_of
 from dougong.pipeline.provenance import Clock, sha256
@@ -22,7 +24,7 @@ from dougong.pipeline.recipes import Recipe, filter_cloud, steps_of
 from dougong.pipeline.removed import removed_sample
 from dougong.pipeline.spooling import spooled
 from dougong.pipeline.steps import Filtered
-from dougong.pipeline.store import Books, Store
+from dougong.pipeline.store import Store
 from dougong.pipeline.tiled import (
     filter_chunks,
     is_too_large,
@@ -54,8 +56,7 @@ class Loader:
 
     def hold(self) -> Hold:
         """Return how many points may be held beside those that wait, and where the others go."""
-        most = self.room.most_tile_points(0, self.waiting) or LEAST_TILE_POINTS
-        return Hold(most, self.scratch)
+        return Hold(self.room.held_points(self.waiting), self.scratch)
 
     def movers(self, entry: Entry, scale: ScaleSearch | None = None) -> list[Mover]:
         """Return what moves as one of a project's cloud, read and filtered.
@@ -124,7 +125,7 @@ class Loader:
         filtered = Filtered(cloud=cloud, codes=nothing, ground_class=nothing, stages=())
         noticed = (*self._noticed(entry, cloud), "not filtered, since its scale is not known")
         removed = cloud.select(np.arange(0))
-        yield self._source(entry, file, -1, Kept.of(cloud), filtered, noticed, removed)
+        yield self._source(entry, file, -1, Kept.of(cloud), Books.of(filtered, noticed), removed)
 
     def _whole(self, entry: Entry, file: Path, digest: str) -> Iterator[Source]:
         """Read the file, then filter its clouds one by one."""
@@ -136,19 +137,18 @@ class Loader:
             cloud, clouds[station] = clouds[station], clouds[station].select(np.arange(0))
             key = self._key(entry, digest, station)
             books = self.store.load(key)
-            if books is not None and len(books.codes) == len(cloud):
+            if books is not None and books.points == len(cloud):
                 self._say_known(cloud.name)
-                kept = Kept.of(self._kept(entry, books.part(cloud, slice(None))))
-                removed = removed_sample(cloud, books.codes, details=books.details)
-                yield self._source(entry, file, station, kept, books, books.noticed, removed)
-                continue
-            with self.clock.measure("filter"):
-                noticed = self._noticed(entry, cloud)
-                filtered = filter_cloud(cloud, entry.kind, self.recipe, self.progress)
-            self.store.save(key, filtered, noticed)
+                ((_, filtered),) = books.along((cloud,))
+            else:
+                with self.clock.measure("filter"):
+                    noticed = self._noticed(entry, cloud)
+                    filtered = filter_cloud(cloud, entry.kind, self.recipe, self.progress)
+                books = Books.of(filtered, noticed)
+                self.store.save(key, books)
             removed = removed_sample(cloud, filtered.codes, details=filtered.details)
             kept = Kept.of(self._kept(entry, filtered))
-            yield self._source(entry, file, station, kept, filtered, noticed, removed)
+            yield self._source(entry, file, station, kept, books, removed)
 
     def _on_tiles(self, entry: Entry, file: Path, digest: str) -> Iterator[Source]:
         """Filter the clouds of a file that does not fit in memory; what is left stays on disk."""
@@ -173,9 +173,8 @@ class Loader:
                     scratch=scratch,
                     progress=self.progress,
                 )
-            self.store.save(key, books, books.noticed)
-            # They are loaded again below, station by station: never two of them at once.
-            del books
+            self.store.save(key, books)
+            shutil.rmtree(scratch, ignore_errors=True)
             if self.store.is_temporary:
                 folder.remove()
         for station, raw in enumerate(stations_of(file, split=not entry.registered)):
@@ -191,7 +190,7 @@ class Loader:
                     self.scratch / f"kept-{key[:16]}",
                     lambda part: self._kept(entry, part),
                 )
-            yield self._source(entry, file, station, kept, known, known.noticed, removed)
+            yield self._source(entry, file, station, kept, known, removed)
 
     def _kept(self, entry: Entry, filtered: Filtered) -> Cloud:
         """Return the kept points, with what they were taken for where that is wanted."""
@@ -219,17 +218,16 @@ class Loader:
         file: Path,
         station: int,
         kept: Kept,
-        books: Filtered | Books,
-        noticed: Iterable[str],
+        books: Books,
         removed: Cloud,
     ) -> Source:
         return Source(
             file=file,
             station=-1 if entry.registered else station,
             kept=kept,
-            tally=Tally.of(books),
+            tally=books.tally(),
             stages=books.stages,
-            points_in=len(books.codes),
+            points_in=books.points,
             removed=removed,
-            notes=(*(f"{file.name}: {note}" for note in noticed), *books.notes),
+            notes=(*(f"{file.name}: {note}" for note in books.noticed), *books.notes),
         )

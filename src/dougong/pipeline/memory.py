@@ -17,9 +17,6 @@ BYTES_PER_WAITING_POINT = 110
 BYTES_PER_REDUCED_POINT = 130
 """Of a cloud on disk, as the registration and the distances hold it."""
 _BYTES_PER_TILE_POINT = 250
-_BYTES_PER_BOOKED_POINT = 8
-"""Of a cloud that was on tiles, the reason, the ground class and the details of every point are
-held, and one mask over them."""
 LEAST_TILE_POINTS = 100_000
 _MOST_TILE_POINTS = 20_000_000
 """Larger tiles gain nothing."""
@@ -45,19 +42,15 @@ class Room:
         """Say whether a cloud of `points` fits beside clouds of `waiting` points in all."""
         return estimated_bytes([points, waiting]) <= self.bytes
 
-    def most_tile_points(self, points: int, waiting: int) -> int | None:
-        """Return how many points a tile of a cloud of `points` may have; None: no room for any."""
-        if tiles_bytes(points, 0, waiting) > self.bytes:
-            return None
-        return self._most_points(self.bytes - tiles_bytes(0, 0, waiting))
-
-    def most_points_beside(self, points: int) -> int:
-        """Return how many points may be worked on while all is held that is known of `points`."""
-        return self._most_points(self.bytes - tiles_bytes(points, 0)) or LEAST_TILE_POINTS
-
-    def _most_points(self, left: float) -> int | None:
-        most = int(min(max(left, 0.0) / _BYTES_PER_TILE_POINT, _MOST_TILE_POINTS))
+    def most_tile_points(self, waiting: int) -> int | None:
+        """Return how many points a tile may have; None: there is no room for any."""
+        left = max(self.bytes - tiles_bytes(0, waiting), 0.0)
+        most = int(min(left / _BYTES_PER_TILE_POINT, _MOST_TILE_POINTS))
         return most if most >= LEAST_TILE_POINTS else None
+
+    def held_points(self, waiting: int = 0) -> int:
+        """Return how many points of an output may be held beside those that wait."""
+        return self.most_tile_points(waiting) or LEAST_TILE_POINTS
 
     def tile_points(self, points: int, waiting: int) -> int:
         """Return how many points a tile of a cloud of `points` may have.
@@ -67,9 +60,9 @@ class Room:
         InputError
             There is no room for any tile worth the name.
         """
-        most = self.most_tile_points(points, waiting)
+        most = self.most_tile_points(waiting)
         if most is None:
-            need = tiles_bytes(points, LEAST_TILE_POINTS, waiting)
+            need = tiles_bytes(LEAST_TILE_POINTS, waiting)
             msg = (
                 f"{points:,} points need about {need / 1e9:.1f} GB even on tiles, more than "
                 f"{self.name()}. Raise it, or give the clouds one by one."
@@ -83,13 +76,10 @@ class Room:
         return asked if self.is_asked else f"the {self.bytes / 1e9:.1f} GB that may be used"
 
 
-def tiles_bytes(points: int, tile_points: int, waiting: int = 0) -> int:
-    """Return the memory that a cloud of `points` needs on tiles of at most `tile_points`.
-
-    What is known of every point is put together when the last tile is done.
-    """
-    tile, books = tile_points * _BYTES_PER_TILE_POINT, points * _BYTES_PER_BOOKED_POINT
-    return BASE_BYTES + waiting * BYTES_PER_WAITING_POINT + max(tile, books)
+def tiles_bytes(tile_points: int, waiting: int = 0) -> int:
+    """Return the memory that a cloud of any size needs on tiles of at most `tile_points`."""
+    tile = tile_points * _BYTES_PER_TILE_POINT
+    return BASE_BYTES + waiting * BYTES_PER_WAITING_POINT + tile
 
 
 def registering_bytes(reduced: int, waiting: int) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,36 +10,13 @@ import numpy as np
 
 from dougong.cloud import Cloud, Frame
 from dougong.errors import FrameError
-from dougong.filters.selection import Reason
 from dougong.formats import is_same_crs
+from dougong.pipeline.books import Tally
 from dougong.pipeline.kept import Kept
 from dougong.pipeline.reduced import Reduced, most_points, reduced
-from dougong.pipeline.removed import detail_counts, ground_kept, reason_counts
-from dougong.pipeline.steps import Filtered, StageCount
-from dougong.pipeline.store import Books
+from dougong.pipeline.steps import StageCount
 from dougong.registration.free_scale import ScaleSearch
 from dougong.typing import Kind
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Tally:
-    """What became of the points of a file, counted."""
-
-    reasons: Counter[str]
-    details: Counter[str]
-    ground: int
-    """Kept points on the ground."""
-
-    @classmethod
-    def of(cls, books: Filtered | Books) -> Tally:
-        """Count what the filters of one file decided."""
-        counts = zip(Reason, reason_counts(books.codes), strict=True)
-        details = detail_counts(books.codes, books.details)
-        return cls(
-            reasons=Counter({reason.name.lower(): points for reason, points in counts}),
-            details=Counter({name: row["points"] for name, row in details.items()}),
-            ground=ground_kept(books.codes, books.ground_class),
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

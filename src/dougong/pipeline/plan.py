@@ -129,7 +129,7 @@ def _planned(
     way: Way = "in memory"
     tile_points, refusal = None, None
     if not room.holds(told.points, waiting):
-        most = room.most_tile_points(told.points, waiting)
+        most = room.most_tile_points(waiting)
         if most is not None:
             way, tile_points = "on tiles", most
         else:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from dougong.pipeline.memory import (
-    LEAST_TILE_POINTS,
     Room,
     estimated_bytes,
     registering_bytes,
@@ -116,7 +115,7 @@ def _filter_stage(file: PlannedFile, row: int, waiting: int, kept_bytes: int) ->
     return PlannedStage(
         name=f"filter {file.cloud}",
         tiles=_tiles(file.points, file.tile_points),
-        memory_bytes=tiles_bytes(file.points, file.tile_points, waiting),
+        memory_bytes=tiles_bytes(file.tile_points, waiting),
         work_bytes=kept_bytes + books + 2 * file.points * (row + _SPOOL_ROW_BYTES),
         seconds=seconds + (_TILES + _READ) * millions,
     )
@@ -141,9 +140,9 @@ def stages_after(
     records = sum(file.points * row_bytes[file.path] for file in files)
     largest = max((file.points * row_bytes[file.path] for file in files), default=0)
     clouds = len({file.cloud for file in files})
-    most = room.most_tile_points(0, sum(held)) or LEAST_TILE_POINTS
+    most = room.held_points(sum(held))
     whole = estimated_bytes(held)
-    parts = tiles_bytes(0, min(points, most), sum(held))
+    parts = tiles_bytes(min(points, most), sum(held))
     reduced = sum(min(file.points, most_points(clouds)) for file in files if file.way == "on tiles")
     registering = max(whole, registering_bytes(reduced, sum(held)))
     is_cut = points > most

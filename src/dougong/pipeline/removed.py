@@ -38,10 +38,8 @@ def ground_kept(codes: NDArray[np.uint8], ground_class: NDArray[np.uint8]) -> in
     return int(np.count_nonzero(is_ground))
 
 
-def detail_counts(
-    codes: NDArray[np.uint8], details: Mapping[str, NDArray[Any]]
-) -> dict[str, dict[str, int]]:
-    """Return, per `Taken`, its code in ``dougong_detail`` and the points that it took.
+def detail_counts(codes: NDArray[np.uint8], details: Mapping[str, NDArray[Any]]) -> dict[str, int]:
+    """Return, per name of a `Taken`, the points that it took.
 
     Empty where the curvature-weighted filter gave no details.
     """
@@ -49,11 +47,7 @@ def detail_counts(
         return {}
     chosen = details[DETAIL][codes == Reason.CURVATURE_WEIGHTED]
     counts = _counted(chosen, len(Taken))
-    return {
-        taken.name.lower(): {"code": int(taken), "points": counts[taken]}
-        for taken in Taken
-        if taken != Taken.KEPT
-    }
+    return {taken.name.lower(): counts[taken] for taken in Taken if taken != Taken.KEPT}
 
 
 def removed_sample(

@@ -4,11 +4,10 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from dougong.cloud import Cloud
-from dougong.errors import InputError
+from dougong.pipeline.books import Books
 from dougong.pipeline.kept import Kept, KeptFile, together
 from dougong.pipeline.removed import removed_sample, shortened
 from dougong.pipeline.steps import Filtered
-from dougong.pipeline.store import Books
 
 
 def spooled(
@@ -30,22 +29,9 @@ def spooled(
     """
     file = KeptFile(folder)
     removed: Cloud | None = None
-    done = 0
-    for chunk in chunks:
-        here = slice(done, done + len(chunk))
-        done += len(chunk)
-        codes = books.codes[here]
-        if len(codes) < len(chunk):
-            break
-        file.add(kept(books.part(chunk, here)))
-        details = {name: values[here] for name, values in books.details.items()}
-        more = removed_sample(chunk, codes, details=details)
+    for chunk, part in books.along(chunks):
+        file.add(kept(part))
+        more = removed_sample(chunk, part.codes, details=part.details)
         removed = more if removed is None else shortened(together([removed, more]))
-    if done != len(books.codes):
-        msg = (
-            f"the finished step that --work keeps is of {len(books.codes):,} points, the cloud has "
-            f"{done:,}. Delete the --work folder."
-        )
-        raise InputError(msg)
     assert removed is not None
     return file.finished(), removed

@@ -7,59 +7,19 @@ registration setting therefore does not filter again, and a changed filter setti
 import hashlib
 import json
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import dougong
-from dougong.cloud import Cloud
-from dougong.filters.selection import Reason
 from dougong.params import Parameters
-from dougong.pipeline.steps import Filtered, StageCount
+from dougong.pipeline.books import Books, Page
+from dougong.pipeline.steps import StageCount
 from dougong.tiles.folder import Folder, LocalFolder
 from dougong.typing import Kind
-
-_ALWAYS = ("codes", "ground_class")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Books:
-    """What a finished step decided about every point of its input; see `Filtered`."""
-
-    codes: NDArray[np.uint8]
-    ground_class: NDArray[np.uint8]
-    stages: tuple[StageCount, ...]
-    notes: tuple[str, ...]
-    noticed: tuple[str, ...]
-    """What reading the input said."""
-    details: Mapping[str, NDArray[Any]]
-
-    def part(self, cloud: Cloud, rows: slice) -> Filtered:
-        """Return the finished step on a part of its input: `cloud` has its points of `rows`."""
-        codes = self.codes[rows]
-        return Filtered(
-            cloud=cloud.select(np.flatnonzero(codes == Reason.KEPT)),
-            codes=codes,
-            ground_class=self.ground_class[rows],
-            stages=self.stages,
-            notes=self.notes,
-            details={name: values[rows] for name, values in self.details.items()},
-        )
-
-    def on(self, kept: Cloud) -> Filtered:
-        """Return the finished step with the points that it kept."""
-        return Filtered(
-            cloud=kept,
-            codes=self.codes,
-            ground_class=self.ground_class,
-            stages=self.stages,
-            notes=self.notes,
-            details=self.details,
-        )
 
 
 class Store:
@@ -90,24 +50,26 @@ class Store:
     def load(self, key: str) -> Books | None:
         """Return the books of a finished step, or None."""
         try:
-            # The books are written last: where they are, the arrays are whole.
-            with self.folder.open(f"{key}.json") as file:
+            # The books are written last: where they are, the pages are whole.
+            with self.folder.open(_cover(key)) as file:
                 told = json.load(file)
-            with self.folder.open(f"{key}.npz") as file, np.load(file) as stored:
-                codes, ground = stored["codes"], stored["ground_class"]
-                details = {name: stored[name] for name in stored.files if name not in _ALWAYS}
         except FileNotFoundError:
             return None
+
+        def page(number: int) -> Page:
+            with self.folder.open(_page(key, number)) as file, np.load(file) as stored:
+                return Page.of(dict(stored))
+
         return Books(
-            codes=codes,
-            ground_class=ground,
+            points=told["points"],
+            page=page,
+            page_points=told["page_points"],
             stages=tuple(StageCount(**stage) for stage in told["stages"]),
             notes=tuple(told["notes"]),
             noticed=tuple(told["noticed"]),
-            details=details,
         )
 
-    def save(self, key: str, filtered: Filtered | Books, noticed: Sequence[str]) -> None:
+    def save(self, key: str, books: Books) -> None:
         """Keep a finished step.
 
         Raises
@@ -115,20 +77,27 @@ class Store:
         OutputError
             The disk is full or the folder cannot be written.
         """
-        arrays: dict[str, Any] = {
-            "codes": filtered.codes,
-            "ground_class": filtered.ground_class,
-            **filtered.details,
+        for number, page in enumerate(books.pages()):
+            columns: dict[str, Any] = page.columns
+            self.folder.write(_page(key, number), partial(np.savez, **columns))
+        cover = {
+            "points": books.points,
+            "page_points": books.page_points,
+            "stages": [asdict(stage) for stage in books.stages],
+            "notes": list(books.notes),
+            "noticed": list(books.noticed),
         }
-        self.folder.write(f"{key}.npz", lambda file: np.savez(file, **arrays))
-        books = {
-            "stages": [asdict(stage) for stage in filtered.stages],
-            "notes": list(filtered.notes),
-            "noticed": list(noticed),
-        }
-        self.folder.write(f"{key}.json", lambda file: file.write(json.dumps(books).encode()))
+        self.folder.write(_cover(key), lambda file: file.write(json.dumps(cover).encode()))
 
     def finish(self) -> None:
         """Forget everything once the run is done, or what is not in the folder that stays."""
         if self.is_temporary or self.folder.local is None:
             shutil.rmtree(self.scratch, ignore_errors=True)
+
+
+def _cover(key: str) -> str:
+    return f"{key}.books.json"
+
+
+def _page(key: str, number: int) -> str:
+    return f"{key}.books.{number}.npz"

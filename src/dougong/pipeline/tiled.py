@@ -11,23 +11,21 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.filters import FILTERS
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
 from dougong.filters.pass_through import PassThrough
-from dougong.filters.selection import DETAILS, Reason
+from dougong.filters.selection import DETAILS
 from dougong.formats import describe, iterate, require_metric
+from dougong.pipeline.books import Binder, Books
 from dougong.pipeline.memory import Room
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.sides import HALO_SHARE
 from dougong.pipeline.steps import StageCount, Step, doubts, nothing_kept
-from dougong.pipeline.store import Books
 from dougong.tiles.cloud import POINTS, TiledCloud, load_tiles, read_arrays
 from dougong.tiles.engine import engine_in_use
 from dougong.tiles.folder import Folder
@@ -123,6 +121,8 @@ def filter_chunks(
 ) -> Books:
     """Filter a cloud that comes in `chunks` without ever holding it; return the books of it.
 
+    They lie in `scratch`.
+
     Parameters
     ----------
     chunks : iterator of Cloud
@@ -136,7 +136,7 @@ def filter_chunks(
     folder : Folder
         Gets the tiles. Those that an earlier run left there are gone on with.
     scratch : Path
-        Gets the cloud while it is cut, twice over; may be the same folder.
+        Gets the cloud while it is cut, twice over, and then the books; may be the same folder.
     progress : Progress
 
     Raises
@@ -160,7 +160,7 @@ def filter_chunks(
     if stages and not stages[-1].points_out:
         raise InputError(nothing_kept(name, tiles.facts["points_in"], stages))
     noticed = (*tiles.facts["notes"], *tiles.facts["faults"])
-    return _books(bench, tuple(stages), tuple(notes), noticed)
+    return _books(bench, tuple(stages), tuple(notes), noticed, scratch / "books")
 
 
 def _run_steps(
@@ -224,26 +224,20 @@ def _grid_stage(tiles: TiledCloud, seconds: float) -> StageCount:
 
 
 def _books(
-    bench: TileBench, stages: tuple[StageCount, ...], notes: tuple[str, ...], noticed: Sequence[str]
+    bench: TileBench,
+    stages: tuple[StageCount, ...],
+    notes: tuple[str, ...],
+    noticed: Sequence[str],
+    scratch: Path,
 ) -> Books:
     """Return what the stages decided about every point of the whole cloud, in its order."""
-    points = bench.cloud.facts["points_in"]
-    codes = np.full(points, Reason.DECIMATED, dtype=np.uint8)
-    ground = np.zeros(points, dtype=np.uint8)
-    details: dict[str, NDArray[Any]] = {}
-    folder = bench.cloud.folder
+    points, folder = bench.cloud.facts["points_in"], bench.cloud.folder
+    binder = Binder(scratch, points)
     for tile in bench.cloud.tiles:
         row = read_arrays(folder, tile, POINTS, "row")["row"]
         state = state_of(folder, tile, bench.state)
-        codes[row], ground[row] = state["code"], state["ground"]
-        for name in DETAILS:
-            if name in state:
-                details.setdefault(name, np.zeros(points, state[name].dtype))[row] = state[name]
+        details = {name: state[name] for name in DETAILS if name in state}
+        binder.add(row, {"codes": state["code"], "ground_class": state["ground"], **details})
     return Books(
-        codes=codes,
-        ground_class=ground,
-        stages=stages,
-        notes=notes,
-        noticed=tuple(noticed),
-        details=details,
+        points=points, page=binder.page, stages=stages, notes=notes, noticed=tuple(noticed)
     )

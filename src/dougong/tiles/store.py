@@ -57,7 +57,7 @@ class RowFile:
         OutputError
             The disk is full, or the folder cannot be written.
         """
-        with _told(self.path), self.path.open("ab") as file:
+        with told(self.path), self.path.open("ab") as file:
             file.write(np.array(len(rows.row), _COUNT).tobytes())
             for values in rows:
                 file.write(_bytes_of(np.ascontiguousarray(values)))
@@ -132,7 +132,7 @@ def _bytes_of(values: NDArray[Any]) -> memoryview:
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def told(path: Path) -> Iterator[None]:
     """Say in one sentence why a tile could not be written."""
     try:
         yield
@@ -150,7 +150,7 @@ RowFileMaker: TypeAlias = Callable[[str, np.dtype[Any]], RowFile]
 
 def make_row_file(folder: Path) -> RowFileMaker:
     """Return a maker of new row files in `folder`, which is made where it is missing."""
-    with _told(folder / "tiles"):
+    with told(folder / "tiles"):
         folder.mkdir(parents=True, exist_ok=True)
 
     def make(name: str, layout: np.dtype[Any]) -> RowFile:
