@@ -8,84 +8,23 @@ Kernels are imported when called.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, model_validator
 
 from dougong._checks import as_points
 from dougong.errors import InputError
-from dougong.filters.clutter_kinds import ClutterKind
+from dougong.filters.clutter_kinds import Clutter, ClutterKind
 from dougong.filters.selection import Selection
-from dougong.params import Parameters
 
 if TYPE_CHECKING:
     from dougong.filters.clutter_search import Whole
 
+__all__ = ["KIND", "Clutter", "clutter", "clutter_notes", "halo_m"]
+
 KIND: Literal["local", "two-pass", "global"] = "two-pass"
-
-Limits = tuple[float, float]
-Name = Literal["person", "vehicle", "pole", "wire"]
-
-
-class Clutter(Parameters):
-    """Which clusters are offered as clutter, and whether they are taken out."""
-
-    action: Literal["off", "mark", "remove"] = "mark"
-    """mark: every point stays and says what it was taken for. remove: the offered points go.
-    off (in the recipes, unless set): nothing is looked for."""
-    kinds: tuple[Name, ...] = ("person", "vehicle", "pole", "wire")
-    """What is offered."""
-    min_margin: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Offer only what lies at least this far within every limit, as a share of the limit."""
-    foot_m: Annotated[float, Field(ge=0)] = 0.25
-    """Points lower than this above the ground join nothing: grass and kerbs would tie all that
-    stands together. They go with the cluster that they are nearest to, within `gap_least_m`."""
-    gap_least_m: Annotated[float, Field(gt=0)] = 0.15
-    """Points nearer to each other than this are one thing, metres."""
-    gap_most_m: Annotated[float, Field(gt=0)] = 0.50
-    """Points farther from each other are not. Between the two, five spacings of the sparser."""
-    min_points: Annotated[int, Field(ge=8)] = 20
-    """A cluster of fewer points has no shape."""
-    person_height_m: Limits = (1.1, 2.1)
-    """Top of a person above the ground."""
-    person_length_m: Limits = (0.25, 1.0)
-    """Longer side of a person's outline in plan."""
-    vehicle_height_m: Limits = (1.2, 2.8)
-    """Top of a car or van above the ground."""
-    vehicle_length_m: Limits = (2.8, 6.0)
-    """Longer side of its outline in plan."""
-    vehicle_width_m: Limits = (1.3, 2.6)
-    """Shorter side."""
-    pole_height_m: Limits = (2.2, 8.0)
-    """Top of a pole above the ground."""
-    pole_radius_m: Annotated[float, Field(gt=0)] = 0.14
-    """Half of a pole's layers stay within this radius: columns are thicker."""
-    pole_clear_m: Annotated[float, Field(ge=0)] = 1.0
-    """A pole is at least this far from everything longer than 3 m, or it may carry a roof."""
-    wire_height_m: Annotated[float, Field(gt=0)] = 2.5
-    """Wires hang at least this high above the ground."""
-    wire_length_m: Annotated[float, Field(gt=0, le=2.0)] = 1.2
-    """A wire goes on for so long to one side of each of its points."""
-
-    @model_validator(mode="after")
-    def _limits_ascend(self) -> Clutter:
-        for name in type(self).model_fields:
-            value = getattr(self, name)
-            if name.endswith("_m") and isinstance(value, tuple) and not 0 < value[0] < value[1]:
-                raise ValueError(f"{name} must ascend from above 0, got {value}. Swap the two.")
-        if self.gap_most_m < self.gap_least_m:
-            raise ValueError("gap_most_m is below gap_least_m. Swap the two.")
-        return self
-
-    @property
-    def largest_m(self) -> float:
-        """The longest side that the box of a person, vehicle or pole can have."""
-        long, wide = self.vehicle_length_m[1], self.vehicle_width_m[1]
-        return max(math.hypot(long, wide), self.pole_height_m[1], self.person_length_m[1])
 
 
 def halo_m(params: Clutter) -> float:

@@ -6,7 +6,7 @@ Kernels are imported when called.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,10 @@ from dougong.filters.clusters import (
     members,
     spacing_of,
 )
-from dougong.filters.clutter_kinds import ClutterKind, kind_of
+from dougong.filters.clutter_kinds import Clutter, ClutterKind, kind_of
 from dougong.filters.clutter_shapes import shape_of
 from dougong.filters.neighbourhood import Neighbourhood, build_index, nearest
 from dougong.typing import Index, Points, Values
-
-if TYPE_CHECKING:
-    from dougong.filters.clutter import Clutter
 
 STRUCTURE_M = 3.0
 """A pole must stand clear of clusters longer than this."""
