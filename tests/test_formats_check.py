@@ -44,7 +44,7 @@ def test_duplicates_are_counted_exactly(tmp_path, suffix):
     points[100:350] = points[7]
     points[-1] = points[0]
     (text,) = texts(saved(tmp_path, points, suffix), "warning")
-    assert "251 of 20000 points lie exactly on another one" in text
+    assert "251 of 20,000 points lie exactly on another one" in text
 
 
 @pytest.mark.parametrize("direction", [[1, 0, 0], [0, 0, -1], [-0.6, 0.8, 0]])
@@ -52,7 +52,7 @@ def test_one_far_point_is_found(tmp_path, direction):
     points = hall()
     points[1234] += 1e6 * np.array(direction)
     (text,) = texts(saved(tmp_path, points, ".ply"), "warning")
-    assert "1 of 20000 points lie far from all others" in text
+    assert "1 of 20,000 points lie far from all others" in text
     assert "e+0" in text or "99" in text
 
 
@@ -116,7 +116,7 @@ def test_a_heap_of_phantoms_at_zero_does_not_shape_the_site(tmp_path):
     cloud = Cloud.from_points(points)
     assert "1,000 of 20,000 points lie far from all others." in faults_of(cloud)
     found = texts(saved(tmp_path, points, ".ply", None), "warning")
-    assert any("1000 of 20000 points lie far from all others" in text for text in found)
+    assert any("1,000 of 20,000 points lie far from all others" in text for text in found)
     assert not any("millimetres" in text for text in [*found, *faults_of(cloud)])
 
 

@@ -270,5 +270,5 @@ def test_too_little_overlap_is_refused_unless_asked():
     strict = Register(verdict=Verdict(least_overlap=1.0))
     found = decide(*pair, starts(turned(0.5)), strict)
     assert found.status == "failed"
-    assert "at least 100% expected" in found.reason
+    assert "at least 100 % expected" in found.reason
     assert "least_overlap" in found.reason

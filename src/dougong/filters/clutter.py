@@ -104,8 +104,8 @@ def clutter_notes(found: Mapping[str, int], has_rows: bool) -> tuple[str, ...]:
         if not points:
             continue
         clusters = found.get(f"{kind.name.lower()}_clusters")
-        many = "points" if clusters is None else f"{clusters} clusters, points"
-        said.append(f"like a {kind.name.lower()}: {many} {points}")
+        many = "points" if clusters is None else f"{clusters:,} clusters, points"
+        said.append(f"like a {kind.name.lower()}: {many} {points:,}")
     notes = [f"offered as clutter: {'; '.join(said)}"] if said else []
     if has_rows:
         notes.append(

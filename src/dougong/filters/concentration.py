@@ -93,6 +93,7 @@ def note_of(found: Tally) -> str | None:
     if fine <= RATIO * plain or fine <= plain + BEYOND:
         return None
     return (
-        f"took {fine:.1%} of the points on fine geometry and {plain:.1%} elsewhere: it may take "
-        "carving (or leaves) for noise. Look at them with --mark and loosen it."
+        f"took {100 * fine:.1f} % of the points on fine geometry and {100 * plain:.1f} % "
+        "elsewhere: it may take carving (or leaves) for noise. Look at them with --mark and "
+        "loosen it."
     )

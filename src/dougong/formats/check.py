@@ -194,7 +194,7 @@ def _of_points(path: Path, info: FileInfo, tally: _Tally) -> list[Finding]:
         found.append(Finding("error", text))
     elif copies:
         text = (
-            f"{path.name}: {copies} of {tally.rows} points lie exactly on another one. "
+            f"{path.name}: {copies:,} of {tally.rows:,} points lie exactly on another one. "
             "The voxel grid keeps one of each."
         )
         found.append(Finding("warning", text))
@@ -225,7 +225,7 @@ def _far_points(path: Path, info: FileInfo, tally: _Tally, low: Any, high: Any) 
         count += int((beyond > 0).sum())
         farthest = max(farthest, float(beyond.max()))
     text = (
-        f"{path.name}: {count} of {info.points} points lie far from all others, up to "
+        f"{path.name}: {count:,} of {info.points:,} points lie far from all others, up to "
         f"{farthest:,.0f} m. Filters drop most of them; crop them before other use."
     )
     return [Finding("warning", text)]

@@ -175,8 +175,9 @@ def doubts(reason: Reason, taken: int, asked: int) -> list[str]:
     if reason not in NOISE or taken <= _MUCH_NOISE * asked:
         return []
     return [
-        f"took {taken} of {asked} points ({taken / asked:.0%}) for noise, far more than surveys "
-        "hold: the cloud may be too sparse for its radii. Look at them with --mark and loosen it."
+        f"took {taken:,} of {asked:,} points ({100 * taken / asked:.0f} %) for noise, far more "
+        "than surveys hold: the cloud may be too sparse for its radii. Look at them with --mark "
+        "and loosen it."
     ]
 
 

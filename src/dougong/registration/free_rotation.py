@@ -338,10 +338,12 @@ def _answer(pair: ObjectPair, judged: _Judged, params: FreeRotation) -> ObjectRe
     )
     share = max(best.explained_source, best.explained_target)
     status: Literal["ok", "ambiguous", "failed"] = "ok"
-    reason = f"the pose explains {share:.0%} of a cloud; no other pose does as well"
+    reason = f"the pose explains {100 * share:.0f} % of a cloud; no other pose does as well"
     if share < params.min_overlap:
         status = "failed"
-        reason = f"the best pose explains only {share:.0%} of either cloud: too little is shared"
+        reason = (
+            f"the best pose explains only {100 * share:.0f} % of either cloud: too little is shared"
+        )
     elif judged.sharpness < params.min_sharpness:
         status, reason = "failed", "the best pose fits hardly better than the poses beside it"
     elif judged.rivals:

@@ -174,10 +174,10 @@ def _clean(points: Points, params: Prepare, notes: list[str]) -> Index:
         return everything
     kept = everything[~far_points(points)]
     if len(kept) < len(points):
-        notes.append(f"{len(points) - len(kept)} of {len(points)} points lie far off: dropped")
+        notes.append(f"{len(points) - len(kept):,} of {len(points):,} points lie far off: dropped")
     is_alone = isolated_points(points[kept])
     if is_alone.any():
-        notes.append(f"{is_alone.sum()} of {len(points)} points stand alone: dropped")
+        notes.append(f"{is_alone.sum():,} of {len(points):,} points stand alone: dropped")
     return kept[~is_alone]
 
 
@@ -224,7 +224,7 @@ def _ground(level: Points, sigma_m: float, params: Prepare, notes: list[str]) ->
     if not params.is_filtered:
         stays = low_outliers(level).is_kept
         if not stays.all():
-            notes.append(f"{(~stays).sum()} thinned points below the ground: dropped")
+            notes.append(f"{(~stays).sum():,} thinned points below the ground: dropped")
     threshold = params.ground_threshold_m or 0.15 + 4.0 * sigma_m
     found = cloth_simulation(level[stays], ClothSimulation(class_threshold_m=threshold))
     is_ground = np.zeros(len(level), dtype=bool)
@@ -237,7 +237,8 @@ def _ground(level: Points, sigma_m: float, params: Prepare, notes: list[str]) ->
     is_known = np.isfinite(height)
     if share < params.min_ground_share or not is_known.any():
         notes.append(
-            f"ground covers only {share:.1%} of the plan: heights counted from the lowest points"
+            f"ground covers only {100 * share:.1f} % of the plan: heights counted from the lowest "
+            "points"
         )
         low = float(np.quantile(level[stays, 2], 0.01))
         return _Ground(np.zeros(len(level), dtype=bool), level[:, 2] - low, stays, False)

@@ -341,27 +341,29 @@ def status_of(ruling: Ruling, fine: FineResult | None, params: Verdict) -> tuple
     overlap = max(fine.overlap_source, fine.overlap_target) if fine is not None else 1.0
     if ruling.sharpness < params.least_sharpness or ruling.explained < params.least_explained:
         return "failed", (
-            f"the best pose explains {ruling.explained:.0%} of the structure near the other cloud, "
-            f"{ruling.sharpness:.1f} times what a pose half a metre beside it does (at least "
-            f"{params.least_explained:.0%} and {params.least_sharpness:g} times expected). Are "
-            "these two clouds of the same place, in the same unit, and do they overlap?"
+            f"the best pose explains {100 * ruling.explained:.0f} % of the structure near the "
+            f"other cloud, {ruling.sharpness:.1f} times what a pose half a metre beside it does "
+            f"(at least {100 * params.least_explained:.0f} % and {params.least_sharpness:g} times "
+            "expected). Are these two clouds of the same place, in the same unit, and do they "
+            "overlap?"
         )
     if overlap < params.least_overlap:
         return "failed", (
-            f"only {overlap:.0%} of either cloud has the other within reach (at least "
-            f"{params.least_overlap:.0%} expected). Scan more of what both show; where they are "
-            "known to share so little, allow less (least_overlap) and check the result."
+            f"only {100 * overlap:.0f} % of either cloud has the other within reach (at least "
+            f"{100 * params.least_overlap:.0f} % expected). Scan more of what both show; where "
+            "they are known to share so little, allow less (least_overlap) and check the result."
         )
     if ruling.violation > params.most_violation:
         return "failed", (
-            f"under the best pose {ruling.violation:.0%} of the structure stands where the other "
-            f"cloud saw free space (at most {params.most_violation:.0%} expected): the true pose "
-            "was not found, or the place was rebuilt. A yaw hint or control points would help."
+            f"under the best pose {100 * ruling.violation:.0f} % of the structure stands where the "
+            f"other cloud saw free space (at most {100 * params.most_violation:.0f} % expected): "
+            "the true pose was not found, or the place was rebuilt. A yaw hint or control points "
+            "would help."
         )
     if ruling.overruled is not None:
         return "ambiguous", (
             f"the clouds contradict the hint or the control points: a pose elsewhere explains "
-            f"{ruling.overruled.gain:.1%} more of the surface (p = "
+            f"{100 * ruling.overruled.gain:.1f} % more of the surface (p = "
             f"{max(ruling.overruled.p_value, 1e-9):.1g}). Check them, or register without them."
         )
     if ruling.undecided:
@@ -375,12 +377,12 @@ def status_of(ruling: Ruling, fine: FineResult | None, params: Verdict) -> tuple
             "facing that way in both clouds, would decide."
         )
     beaten = (
-        f"the next pose contradicts {ruling.beaten[0].gain:.1%} more of the surface "
+        f"the next pose contradicts {100 * ruling.beaten[0].gain:.1f} % more of the surface "
         f"(p = {max(ruling.beaten[0].p_value, 1e-9):.1g} over {ruling.beaten[0].blocks} blocks)"
         if ruling.beaten
         else "no other pose fits at all"
     )
     return "ok", (
-        f"the pose explains {ruling.explained:.0%} of the structure near the other cloud, "
+        f"the pose explains {100 * ruling.explained:.0f} % of the structure near the other cloud, "
         f"{ruling.sharpness:.1f} times what a pose half a metre beside it does; {beaten}."
     )
