@@ -154,8 +154,7 @@ def _beside(
     low, at = low[at >= 0], at[at >= 0]
     if not len(low):
         return {}
-    sorted_place = np.empty(len(index.order), np.int64)
-    sorted_place[index.order] = np.arange(len(index.order))
+    sorted_place = index.unsorted(np.arange(len(index.order)))
     root = clusters.root[sorted_place[at]]
     order = np.argsort(root, kind="stable")
     roots, starts = np.unique(root[order], return_index=True)

@@ -6,7 +6,8 @@ answers are exact; equal distances are ranked by content (x, y, z), so no answer
 order, thread count or, since work is in local metres, on the coordinates' size.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +18,8 @@ from dougong.errors import InputError
 from dougong.kernels import boxtree, moments, neighbours, order, self_neighbours
 from dougong.threads import for_blocks
 from dougong.typing import Index, Mask, Points, Values
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 _SUBTREES = 32
 """Parts of the tree that are built apart, on the threads."""
@@ -37,6 +40,12 @@ class Neighbourhood(NamedTuple):
     """(n,) place in the caller's array of each sorted point."""
     boxes: NDArray[np.float64]
     """(2 leaves, 6) low and high corner of every node (see `kernels.boxtree`)."""
+
+    def unsorted(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Return `values` (n, ...) of the points in sorted order in the caller's order."""
+        result = np.empty_like(values)
+        result[self.order] = values
+        return result
 
 
 class Surface(NamedTuple):
@@ -242,11 +251,23 @@ def blocks_of_leaves(index: Neighbourhood) -> tuple[int, int]:
     return len(index.boxes) // 2, _BLOCK // boxtree.LEAF
 
 
-def leaves_of(index: Neighbourhood, is_wanted: Mask) -> list[tuple[int, int]]:
-    """Return (first leaf, last leaf + 1) of blocks that hold all wanted points (n,), few others.
+def over_leaves(index: Neighbourhood, is_wanted: Mask, task: Callable[[int, int], None]) -> None:
+    """Call ``task(first leaf, last leaf + 1)`` over blocks that hold all wanted points, few others.
 
-    In sorted order. For passes over a part of an index, such as a tile's own points.
+    On the threads. is_wanted (n,), in sorted order. For passes over a part of an index, such as a
+    tile's own points.
     """
+    blocks = _leaves_of(index, is_wanted)
+
+    def some(start: int, stop: int) -> None:
+        for first, last in blocks[start:stop]:
+            task(first, last)
+
+    for_blocks(len(blocks), 1, some)
+
+
+def _leaves_of(index: Neighbourhood, is_wanted: Mask) -> list[tuple[int, int]]:
+    """Return (first leaf, last leaf + 1) of blocks that hold all wanted points (n,), few others."""
     leaves, n = len(index.boxes) // 2, len(index.points)
     if not is_wanted.any():
         return []
@@ -262,10 +283,10 @@ def leaves_of(index: Neighbourhood, is_wanted: Mask) -> list[tuple[int, int]]:
     return blocks
 
 
-def points_of(index: Neighbourhood, leaves: tuple[int, int]) -> tuple[int, int]:
-    """Return (first, last + 1) of the points, in sorted order, in a block of leaves."""
-    n, count = len(index.points), len(index.boxes) // 2
-    return leaves[0] * n // count, leaves[1] * n // count
+def points_of(index: Neighbourhood, first_leaf: int, last_leaf: int) -> tuple[int, int]:
+    """Return (first, last + 1) of the points, in sorted order, in leaves first .. last - 1."""
+    n, leaves = len(index.points), len(index.boxes) // 2
+    return first_leaf * n // leaves, last_leaf * n // leaves
 
 
 def self_knn_block(
@@ -275,7 +296,7 @@ def self_knn_block(
 
     Everything in sorted order: for passes that reduce neighbours at once, never holding n k.
     """
-    start, stop = points_of(index, (first_leaf, last_leaf))
+    start, stop = points_of(index, first_leaf, last_leaf)
     places = np.empty((stop - start, k), np.int64)
     distance2 = np.empty((stop - start, k))
     self_neighbours.self_knn(
@@ -338,11 +359,4 @@ def normals(
 
     if n:
         for_blocks(*blocks_of_leaves(index), task)
-    return Surface(*(_unsorted(index, values) for values in surface))
-
-
-def _unsorted(index: Neighbourhood, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return per-point `values`, given in sorted order, in the caller's order."""
-    result = np.empty_like(values)
-    result[index.order] = values
-    return result
+    return Surface(*(index.unsorted(values) for values in surface))

@@ -31,7 +31,6 @@ from dougong.filters.surroundings import (
     distance_limits,
     test_cloud,
 )
-from dougong.threads import for_blocks
 from dougong.typing import Index, Mask, Points, Values
 
 __all__ = ["CHARGE", "NEIGHBOURS", "TESTS", "Taken", "distance_limits"]
@@ -192,7 +191,7 @@ def rows_excused(few: Doubtful, own: int, reach_m: float) -> Values:
     A wire that a scan met in a few places is nothing to its neighbours, and chance makes no rows:
     those count that would go, as others do within `row_halo_m`.
     """
-    from dougong.filters.neighbourhood import build_index, leaves_of, self_knn_block
+    from dougong.filters.neighbourhood import build_index, over_leaves, self_knn_block
     from dougong.kernels import protective as kernels
 
     chosen = np.flatnonzero(few.margin > 1.0)
@@ -202,19 +201,17 @@ def rows_excused(few: Doubtful, own: int, reach_m: float) -> Values:
     # Where next to nothing is in reach, the spacing says so little that a row would be a road.
     usual = np.minimum(few.spacing_m[place], ROW_REACH * reach_m)
     reach = row_halo_m(reach_m)
-    blocks = leaves_of(index, place < own)
 
     def task(first: int, last: int) -> None:
-        for block in blocks[first:last]:
-            start, near, _ = self_knn_block(index, ROW_NEIGHBOURS, reach**2, *block)
-            accident = np.empty(len(near))
-            kernels.rows(index.points, near, usual, ROW_WIDTH, reach, start, accident)
-            mine = place[start : start + len(near)]
-            is_sure = (accident < 0.0) & (mine < own)
-            sure = mine[is_sure]
-            margin[sure] = np.minimum(margin[sure], math.log(ROW_ACCIDENTS) / accident[is_sure])
+        start, near, _ = self_knn_block(index, ROW_NEIGHBOURS, reach**2, first, last)
+        accident = np.empty(len(near))
+        kernels.rows(index.points, near, usual, ROW_WIDTH, reach, start, accident)
+        mine = place[start : start + len(near)]
+        is_sure = (accident < 0.0) & (mine < own)
+        sure = mine[is_sure]
+        margin[sure] = np.minimum(margin[sure], math.log(ROW_ACCIDENTS) / accident[is_sure])
 
-    for_blocks(len(blocks), 1, task)
+    over_leaves(index, place < own, task)
     return margin
 
 

@@ -95,19 +95,17 @@ def nearest_distances(
 
     Of the first `own` points in the caller's order; nothing beyond `most_m` is near.
     """
-    from dougong.filters.neighbourhood import leaves_of, self_knn_block
+    from dougong.filters.neighbourhood import over_leaves, self_knn_block
 
     n = len(index.points)
     mean, largest = np.full(n, np.inf), np.full(n, np.inf)
-    blocks = leaves_of(index, index.order < own) if n > 1 else []
 
-    def task(start: int, stop: int) -> None:
-        for block in blocks[start:stop]:
-            first, _, distance2 = self_knn_block(index, k, most_m**2, *block)
-            rows = index.order[first : first + len(distance2)]
-            mean[rows], largest[rows] = mean_and_largest(np.sqrt(distance2))
+    def task(first: int, last: int) -> None:
+        start, _, distance2 = self_knn_block(index, k, most_m**2, first, last)
+        rows = index.order[start : start + len(distance2)]
+        mean[rows], largest[rows] = mean_and_largest(np.sqrt(distance2))
 
-    for_blocks(len(blocks), 1, task)
+    over_leaves(index, index.order < own, task)
     return mean[:own], largest[:own]
 
 
@@ -141,9 +139,7 @@ def _mean_within(xyz: Points, radius_m: float) -> Values:
         for_blocks(len(xyz), 1 << 14, task)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.where(counts > 0, sums * _STEP_M / counts, np.inf)
-    result = np.empty(len(xyz))
-    result[index.order] = mean
-    return result
+    return index.unsorted(mean)
 
 
 def cut_distance(mean_m: ValueBlocks, multiplier: float) -> tuple[float, int]:

@@ -6,7 +6,6 @@ Of a cloud, or of a part with a halo of `HALO` reaches. Kernels are imported whe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -183,21 +182,19 @@ def _neighbours(
     index: Neighbourhood, reach_m: float | None, is_seen: Mask
 ) -> tuple[NDArray[np.int32], Values]:
     """Return the places (n, 12) of every seen point's nearest, and the distance of the eighth."""
-    from dougong.filters.neighbourhood import leaves_of, self_knn_block
+    from dougong.filters.neighbourhood import over_leaves, self_knn_block
 
     n = len(index.points)
     places = np.full((n, NEIGHBOURS), -1, np.int32)
     eighth = np.full(n, np.inf)
     limit2 = np.inf if reach_m is None else reach_m**2
-    blocks = leaves_of(index, is_seen)
 
     def task(first: int, last: int) -> None:
-        for block in blocks[first:last]:
-            start, found, distance2 = self_knn_block(index, NEIGHBOURS, limit2, *block)
-            places[start : start + len(found)] = found
-            eighth[start : start + len(found)] = np.sqrt(distance2[:, TESTS - 1])
+        start, found, distance2 = self_knn_block(index, NEIGHBOURS, limit2, first, last)
+        places[start : start + len(found)] = found
+        eighth[start : start + len(found)] = np.sqrt(distance2[:, TESTS - 1])
 
-    for_blocks(len(blocks), 1, task)
+    over_leaves(index, is_seen, task)
     return places, eighth
 
 
@@ -214,6 +211,7 @@ def _tested(
 
     The places in `across` are those in the array behind the index.
     """
+    from dougong.filters.neighbourhood import over_leaves, points_of
     from dougong.kernels import protective as kernels
 
     n = len(index.points)
@@ -222,21 +220,23 @@ def _tested(
     limits = distance_limits(tests.surface_loss)
     stretch = line_stretch(limits)
 
-    def see(start: int, stop: int) -> None:
+    def see(first: int, last: int) -> None:
+        start, stop = points_of(index, first, last)
         kernels.frames(
             index.points, places, tests.alpha, tests.gamma, spacing, stretch, start, stop,
             curvature, frame,
         )  # fmt: skip
 
-    def test(start: int, stop: int) -> None:
+    def test(first: int, last: int) -> None:
+        start, stop = points_of(index, first, last)
         kernels.support(
             index.points, places, frame, spacing, limits, reach, CHARGE, start, stop,
             margin, decisive,
         )  # fmt: skip
 
     is_own = index.order < own
-    _over(index, is_seen, see)
-    _over(index, is_own, test)
+    over_leaves(index, is_seen, see)
+    over_leaves(index, is_own, test)
     group, across = _links(index, places, frame, spacing, is_own)
     rows = np.empty(own, np.int64)
     rows[index.order[is_own]] = np.flatnonzero(is_own)
@@ -248,19 +248,6 @@ def _tested(
         group[rows],
         across,
     )
-
-
-def _over(index: Neighbourhood, is_wanted: Mask, task: Callable[[int, int], None]) -> None:
-    """Call ``task(start, stop)`` over blocks of sorted points that hold all that are wanted."""
-    from dougong.filters.neighbourhood import leaves_of, points_of
-
-    blocks = [points_of(index, block) for block in leaves_of(index, is_wanted)]
-
-    def some(first: int, last: int) -> None:
-        for start, stop in blocks[first:last]:
-            task(start, stop)
-
-    for_blocks(len(blocks), 1, some)
 
 
 def _links(

@@ -78,9 +78,7 @@ def fpfh(
     if n:
         for_blocks(*neighbourhood.blocks_of_leaves(index), first_pass)
         for_blocks(*neighbourhood.blocks_of_leaves(index), second_pass)
-    unsorted = np.empty_like(result)
-    unsorted[index.order] = result
-    return unsorted
+    return index.unsorted(result)
 
 
 def nearest_features(queries: Points, features: Points, k: int) -> tuple[Index, Values]:

@@ -44,9 +44,9 @@ def surface(points: Points, neighbours: int) -> Surface:
     width = np.clip(plane.planarity / _LEAST_WIDTH, 0.0, 1.0)
     flatness = np.clip(1.0 - 3.0 * plane.variation, 0.0, 1.0) * width
     return Surface(
-        normals=_as_given(index, np.where(is_plane[:, None], plane.normals, [0.0, 0.0, 1.0])),
-        planarity=_as_given(index, np.where(is_plane, flatness, 0.0)),
-        area_m2=_as_given(index, np.pi * np.minimum(widest, reach) ** 2 / _AREA_NEIGHBOURS),
+        normals=index.unsorted(np.where(is_plane[:, None], plane.normals, [0.0, 0.0, 1.0])),
+        planarity=index.unsorted(np.where(is_plane, flatness, 0.0)),
+        area_m2=index.unsorted(np.pi * np.minimum(widest, reach) ** 2 / _AREA_NEIGHBOURS),
         spacing_m=spacing,
     )
 
@@ -86,10 +86,3 @@ def _planes(
 
     for_blocks(n, _BLOCK, task)
     return planes
-
-
-def _as_given(index: Neighbourhood, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return values (n, ...) of the sorted points in the caller's order."""
-    result = np.empty_like(values)
-    result[index.order] = values
-    return result
