@@ -9,13 +9,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.kernels._arrays import Floats, Ints
+from dougong.kernels._arrays import Floats, Ints, Small
 from dougong.kernels._jit import kernel
 from dougong.kernels.boxtree import box_distance2
 from dougong.kernels.disjoint import join, root_of
 from dougong.kernels.moments import eigen3
 
-Small = NDArray[np.int32]
 Singles = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
