@@ -29,11 +29,12 @@ from dougong.filters.surroundings import (
     Tested,
     Tests,
     distance_limits,
+    reach_for,
     test_cloud,
 )
 from dougong.typing import Index, Mask, Points, Values
 
-__all__ = ["CHARGE", "NEIGHBOURS", "TESTS", "Taken", "distance_limits"]
+__all__ = ["CHARGE", "NEIGHBOURS", "TESTS", "Taken", "distance_limits", "reach_for"]
 
 ROW_NEIGHBOURS, ROW_WIDTH, ROW_ACCIDENTS = 24, 0.5, 1e-3
 """A point stays if, among this many nearest of those that would go, a row (this many spacings to
@@ -90,13 +91,6 @@ def halo_m(reach_m: float | None) -> float:
     if reach_m is None:
         return math.inf
     return reach_m * (5.0 * GROUP + 3.0 + 2.0 * FAR_CELLS)
-
-
-def reach_for(points: ArrayLike) -> float:
-    """Return the reach, metres, for a cloud (n, 3): `surroundings.REACH_M` where it suits."""
-    from dougong.filters.neighbourhood import build_index
-
-    return test_cloud(build_index(points), None, Tests(0.0, 0.0, 0.1))[1]
 
 
 def judge(points: ArrayLike, tests: Tests, reach_m: float | None = None) -> Verdict:

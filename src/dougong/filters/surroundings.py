@@ -10,7 +10,7 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dougong._boxes import are_within, corners_of
 from dougong.filters.groups import LINK
@@ -98,6 +98,16 @@ def reach_of(eighth_m: ValueBlocks, points: int) -> float:
     while reach > 2.0 * DENSE * max(spacing, SMALLEST_M):
         reach /= 2.0
     return reach
+
+
+def reach_for(points: ArrayLike) -> float:
+    """Return the reach, metres, for a cloud (n, 3): `REACH_M` where it suits."""
+    from dougong.filters.neighbourhood import build_index
+
+    index = build_index(points)
+    n = len(index.points)
+    _, eighth = _neighbours(index, None, np.ones(n, bool))
+    return reach_of(lambda: (eighth,), n)
 
 
 def distance_limits(surface_loss: float) -> Values:
