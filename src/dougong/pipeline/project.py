@@ -248,12 +248,17 @@ def all_files(project: Project, folder: Path) -> list[Path]:
     """
     known: dict[Path, Path] = {}
     for file in (file for entry in project.cloud for file in files_of(entry, folder)):
-        before = known.setdefault(file.resolve(), file)
-        if before is not file:
-            names = f"{file} is" if before == file else f"{before} and {file} are"
-            raise InputError(f"{names} one file, named twice. Name each file once.")
+        _refuse_twice(file, known)
         kind_of(file)
     return list(known.values())
+
+
+def _refuse_twice(file: Path, known: dict[Path, Path]) -> None:
+    """Add `file` to the files known by where they lie; raise InputError where it is one of them."""
+    before = known.setdefault(file.resolve(), file)
+    if before is not file:
+        names = f"{file} is" if before == file else f"{before} and {file} are"
+        raise InputError(f"{names} one file, named twice. Name each file once.")
 
 
 def refuse_own_result(files: Sequence[Path], out: Path) -> None:
@@ -293,10 +298,7 @@ def from_files(lidar: Sequence[Path], photogrammetry: Sequence[Path]) -> Project
     for _, path in kinds:
         if not is_text(path):
             raise InputError(f"the name of {path} is no UTF-8 text. Rename it.")
-        one = known.setdefault(path.resolve(), path)
-        if one is not path:
-            both = f"{path} is" if one == path else f"{one} and {path} are"
-            raise InputError(f"{both} one file, named twice. Name each file once.")
+        _refuse_twice(path, known)
         before = names.setdefault(stem(path), path)
         if before is path:
             continue
