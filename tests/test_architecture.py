@@ -16,7 +16,7 @@ ALLOWED = {
     "filters": BASE | {"_sorting", "cloud", "kernels"},
     "formats": BASE | {"_sorting", "cloud", "kernels"},
     "registration": BASE | {"_sorting", "cloud", "kernels", "filters"},
-    "tiles": BASE | {"cloud", "kernels", "filters", "formats"},
+    "tiles": BASE | {"_sorting", "cloud", "kernels", "filters", "formats"},
     "pipeline": BASE
     | {"_sorting", "cloud", "kernels", "filters", "formats", "registration", "tiles"},
     "evaluation": BASE | {"cloud", "kernels", "filters", "formats", "registration", "pipeline"},

@@ -6,7 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dougong._sorting import by_coordinates, count_rows, distinct, grouped, once, sorted_places
+from dougong._sorting import (
+    by_coordinates,
+    count_rows,
+    distinct,
+    grouped,
+    keys_of_rows,
+    once,
+    sorted_places,
+)
 
 SIZES = st.integers(0, 60)
 SOME = [-(2**63), -1, 0, 1, 7, 2**40, 2**63 - 1]
@@ -46,6 +54,18 @@ def test_distinct_is_numpys_unique(keys):
 )
 def test_rows_are_counted_once_each(cells, scale):
     assert count_rows(cells * scale) == len(np.unique(cells, axis=0))
+
+
+@given(
+    arrays(np.int64, st.tuples(st.integers(0, 60), st.just(3)), elements=st.sampled_from(SOME[1:6]))
+)
+def test_keys_of_rows_tell_rows_apart_and_keep_their_order(cells):
+    keys = keys_of_rows(tuple(cells.T))
+    if keys is None:
+        assert np.prod(np.ptp(cells, axis=0) + 1.0) >= 2.0**63
+        return
+    wanted = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    np.testing.assert_array_equal(grouped(keys).place, wanted)
 
 
 @settings(deadline=None)

@@ -4,6 +4,7 @@ The kernel is imported when called.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -74,16 +75,26 @@ def once(ordered: NDArray[Number]) -> NDArray[Number]:
 
 def count_rows(cells: NDArray[np.int64]) -> int:
     """Return how many different rows `cells` (n, k) has."""
-    if not len(cells):
-        return 0
-    low, high = cells.min(axis=0), cells.max(axis=0)
-    spans = [int(last) - int(first) + 1 for first, last in zip(low, high, strict=True)]
+    keys = keys_of_rows(tuple(cells.T))
+    return len(np.unique(cells, axis=0)) if keys is None else len(distinct(keys))
+
+
+def keys_of_rows(columns: Sequence[NDArray[np.int64]]) -> NDArray[np.int64] | None:
+    """Return one number (n,) from 0 on for each row, in the order of the rows.
+
+    columns, each (n,): the first counts most. None where the rows are too far apart for 63 bits.
+    """
+    if not len(columns[0]):
+        return np.zeros(0, np.int64)
+    lows = [int(column.min()) for column in columns]
+    spans = [int(column.max()) - low + 1 for column, low in zip(columns, lows, strict=True)]
     if math.prod(spans) >= 1 << 63:
-        return len(np.unique(cells, axis=0))
-    key = np.zeros(len(cells), np.int64)
-    for column, span in enumerate(spans):
-        key = key * span + (cells[:, column] - low[column])
-    return len(distinct(key))
+        return None
+    keys = columns[0] - lows[0]
+    for column, low, span in zip(columns[1:], lows[1:], spans[1:], strict=True):
+        keys *= span
+        keys += column - low
+    return keys
 
 
 def grouped(keys: NDArray[np.int64]) -> Groups:

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong._boxes import corners_of
-from dougong._sorting import distinct, grouped
+from dougong._sorting import count_rows, grouped, keys_of_rows
 from dougong.registration.icp_solve import FREE, normal_equations, plane_rows, solve
 from dougong.registration.overlap import Pairs
 from dougong.typing import Index, Points, Values
@@ -28,21 +27,23 @@ _DRAWN_POINTS = 400
 
 def blocks_of(points: Points, size_m: float) -> tuple[Index, int]:
     """Return the block (n,) each point lies in, numbered in space, and how many there are."""
-    blocks = grouped(_block_keys(points, size_m))
+    cells = _cells(points, size_m)
+    keys = keys_of_rows(tuple(cells.T))
+    if keys is None:
+        held, place = np.unique(cells, axis=0, return_inverse=True)
+        return place.reshape(-1), len(held)
+    blocks = grouped(keys)
     return blocks.place, len(blocks.keys)
 
 
 def count_blocks(points: Points, size_m: float) -> int:
     """Return how many blocks `points` (n, 3), n > 0, lie in."""
-    return len(distinct(_block_keys(points, size_m)))
+    return count_rows(_cells(points, size_m))
 
 
-def _block_keys(points: Points, size_m: float) -> NDArray[np.int64]:
-    low, high = (np.floor(corner / size_m).astype(np.int64) for corner in corners_of(points))
-    cell = np.floor(points / size_m).astype(np.int64) - low
-    size = high - low + 1
-    key: NDArray[np.int64] = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
-    return key
+def _cells(points: Points, size_m: float) -> NDArray[np.int64]:
+    """Return the cell (n, 3), of edge `size_m`, that each point lies in."""
+    return np.floor(points / size_m).astype(np.int64)
 
 
 class Jackknife(NamedTuple):
