@@ -71,14 +71,20 @@ def _cache_folder(module: str) -> Path | None:
     return folder if _is_writable(folder) else None
 
 
-def _compile(func: Callable[P, R], fastmath: bool | set[str]) -> Callable[P, R]:
+def _compile(
+    func: Callable[P, R], fastmath: bool | set[str], forceinline: bool = False
+) -> Callable[P, R]:
     module = func.__module__
     folder = _cache_folder(module.rsplit(".", 1)[1]) if module.startswith(f"{_PACKAGE}.") else None
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(folder or "")
     try:
         compiled: Callable[P, R] = numba.njit(
-            cache=folder is not None, nogil=True, error_model="numpy", fastmath=fastmath
+            cache=folder is not None,
+            nogil=True,
+            error_model="numpy",
+            fastmath=fastmath,
+            forceinline=forceinline,
         )(func)
     finally:
         numba.config.CACHE_DIR = before
@@ -102,6 +108,14 @@ def _forgive_a_full_disk(compiled: Any) -> None:
 def kernel(func: Callable[P, R]) -> Callable[P, R]:
     """Compile a serial kernel: lazy types, cached on disk, GIL released, exact arithmetic."""
     return _compile(func, fastmath=False)
+
+
+def inlined_kernel(func: Callable[P, R]) -> Callable[P, R]:
+    """Compile a kernel that is put into those that call it: for the innermost walks.
+
+    Left to itself the compiler calls the larger ones, and a search takes a tenth longer.
+    """
+    return _compile(func, fastmath=False, forceinline=True)
 
 
 def summing_kernel(func: Callable[P, R]) -> Callable[P, R]:

@@ -11,10 +11,10 @@ import numpy as np
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel, summing_kernel
 from dougong.kernels.ball_walk import SHARE, look, make_walk, size_of
-from dougong.kernels.boxtree import LEAF, box_distance2
+from dougong.kernels.boxtree import LEAF
 from dougong.kernels.moments import add_products, eigen3
+from dougong.kernels.neighbours import DEPTH, next_leaf
 
-_DEPTH = 64
 _CHUNK = 64
 """Leaves on the rim that are looked at together: their points fit the fast cache."""
 
@@ -299,8 +299,8 @@ def least_weighted(
     """
     n = points.shape[0]
     leaves = boxes.shape[0] // 2
-    stack = np.empty(_DEPTH, np.int64)
-    bound = np.empty(_DEPTH, np.float64)
+    stack = np.empty(DEPTH, np.int64)
+    bound = np.empty(DEPTH, np.float64)
     for q in range(start, stop):
         x, y, z = points[q, 0], points[q, 1], points[q, 2]
         radius2 = radii[q] * radii[q]
@@ -308,25 +308,11 @@ def least_weighted(
         stack[0] = 1
         bound[0] = 0.0
         height = 1
-        while height > 0:
-            height -= 1
-            if bound[height] > min(best2, radius2):
-                continue
-            node = stack[height]
-            while node < leaves:
-                left = box_distance2(boxes, 2 * node, x, y, z)
-                right = box_distance2(boxes, 2 * node + 1, x, y, z)
-                near = 2 * node if left <= right else 2 * node + 1
-                if max(left, right) <= min(best2, radius2):
-                    stack[height] = 4 * node + 1 - near
-                    bound[height] = max(left, right)
-                    height += 1
-                if min(left, right) > min(best2, radius2):
-                    break
-                node = near
-            if node < leaves:
-                continue
-            leaf = node - leaves
+        while True:
+            limit2 = min(best2, radius2)
+            leaf, height = next_leaf(boxes, x, y, z, limit2, stack, bound, height)
+            if leaf < 0:
+                break
             for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
                 dx = points[i, 0] - x
                 dy = points[i, 1] - y

@@ -7,7 +7,7 @@ which the points came; only exact duplicates are told apart by their place.
 import numpy as np
 
 from dougong.kernels._arrays import Floats, Ints
-from dougong.kernels._jit import kernel
+from dougong.kernels._jit import inlined_kernel, kernel
 from dougong.kernels.boxtree import (
     box_distance2,
     box_far_distance2,
@@ -17,6 +17,45 @@ from dougong.kernels.boxtree import (
 
 DEPTH = 64
 """Nodes that a search can have before it, at most."""
+
+
+@inlined_kernel
+def next_leaf(
+    boxes: Floats,
+    x: float,
+    y: float,
+    z: float,
+    limit2: float,
+    stack: Ints,
+    bound: Floats,
+    height: int,
+) -> tuple[int, int]:
+    """Return the next leaf within sqrt(limit2), inclusive, of x, y, z, and what the stack holds.
+
+    -1 where none is left. Nearest children first. stack and bound (DEPTH,): nodes still to visit
+    and their squared distances, `height` of them; the caller puts the root there.
+    """
+    leaves = boxes.shape[0] // 2
+    while height > 0:
+        height -= 1
+        if bound[height] > limit2:
+            continue
+        node = stack[height]
+        while node < leaves:
+            left = box_distance2(boxes, 2 * node, x, y, z)
+            right = box_distance2(boxes, 2 * node + 1, x, y, z)
+            near = 2 * node if left <= right else 2 * node + 1
+            far = max(left, right)
+            if far <= limit2:
+                stack[height] = 4 * node + 1 - near
+                bound[height] = far
+                height += 1
+            if min(left, right) > limit2:
+                break
+            node = near
+        if node >= leaves:
+            return node - leaves, height
+    return -1, 0
 
 
 @kernel
@@ -41,26 +80,10 @@ def nearest_one(
     stack[0] = 1
     bound[0] = box_distance2(boxes, 1, x, y, z)
     height = 1
-    while height > 0:
-        height -= 1
-        if bound[height] > best:
-            continue
-        node = stack[height]
-        while node < leaves:
-            left = box_distance2(boxes, 2 * node, x, y, z)
-            right = box_distance2(boxes, 2 * node + 1, x, y, z)
-            near = 2 * node if left <= right else 2 * node + 1
-            far = max(left, right)
-            if far <= best:
-                stack[height] = 4 * node + 1 - near
-                bound[height] = far
-                height += 1
-            if min(left, right) > best:
-                break
-            node = near
-        if node < leaves:
-            continue
-        leaf = node - leaves
+    while True:
+        leaf, height = next_leaf(boxes, x, y, z, best, stack, bound, height)
+        if leaf < 0:
+            break
         for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
             dx = points[i, 0] - x
             dy = points[i, 1] - y
@@ -171,29 +194,13 @@ def descend(
     stack[0] = root
     bound[0] = box_distance2(boxes, root, x, y, z)
     height = 1
-    while height > 0:
-        height -= 1
-        worst = d2s[last]
-        if bound[height] > worst:
-            continue
-        if worst == 0.0 and held > last:
-            # k copies of the query: more of them have the same coordinates. Without this a heap
-            # of n duplicates would cost n visits for each of them.
-            return held
-        node = stack[height]
-        while node < leaves:
-            left = box_distance2(boxes, 2 * node, x, y, z)
-            right = box_distance2(boxes, 2 * node + 1, x, y, z)
-            near = 2 * node if left <= right else 2 * node + 1
-            if max(left, right) <= worst:
-                stack[height] = 4 * node + 1 - near
-                bound[height] = max(left, right)
-                height += 1
-            if min(left, right) > worst:
-                break
-            node = near
-        if node >= leaves:
-            held = scan_leaf(points, node - leaves, leaves, x, y, z, skip, places, d2s, held)
+    # With k copies of the query at hand, more of them have the same coordinates. Without this a
+    # heap of n duplicates would cost n visits for each of them.
+    while d2s[last] > 0.0 or held <= last:
+        leaf, height = next_leaf(boxes, x, y, z, d2s[last], stack, bound, height)
+        if leaf < 0:
+            break
+        held = scan_leaf(points, leaf, leaves, x, y, z, skip, places, d2s, held)
     return held
 
 
