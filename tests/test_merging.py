@@ -8,10 +8,15 @@ import pytest
 
 from dougong.cloud import Cloud, joined_pieces
 from dougong.formats.model import Hold
-from dougong.pipeline.merging import REASON, Merge, Part, better_first, choose
+from dougong.pipeline.merging import REASON, Merge, Part, better_of, choose
+from dougong.pipeline.sides import whole
 from dougong.pipeline.zones import grid_over, zones_of
 
 QUICK = Merge(zone_m=0.5, reach_m=0.05)
+
+
+def better(one, other, params):
+    return better_of(whole(one, other), params)
 
 
 def wall(rng, length, per_m2, noise, start=0.0, y=0.0):
@@ -61,7 +66,7 @@ def test_equals_the_slow_reference(seam):
     scan, drone = seam
     grid = grid_over([scan, drone], QUICK.zone_m)
     expected = slow_covered(drone, scan, zones_of(drone, grid), zones_of(scan, grid), QUICK)
-    found = better_first(scan, drone, QUICK)
+    found = better(scan, drone, QUICK)
     np.testing.assert_array_equal(found.kept_other, ~expected)
     assert found.kept_one.all()
     assert 0.3 < expected.mean() < 0.6
@@ -69,7 +74,7 @@ def test_equals_the_slow_reference(seam):
 
 def test_the_walls_are_the_scanners_and_no_hole_opens_at_the_seam(seam):
     scan, drone = seam
-    found = better_first(scan, drone, QUICK)
+    found = better(scan, drone, QUICK)
     inside = (drone[:, 0] > 3.2) & (drone[:, 0] < 5.8)
     assert found.kept_other[inside].mean() < 0.01
     assert found.kept_other[drone[:, 0] > 6.1].all()
@@ -94,7 +99,7 @@ def test_a_zone_in_which_the_scanner_is_worse_goes_to_the_drone():
     # The scanner grazes the far part: mixed pixels, 3 cm.
     scan = np.vstack([wall(rng, 6, 900, 0.002), wall(rng, 3, 900, 0.03, start=7.0)])
     drone = wall(rng, 10, 900, 0.010)
-    found = better_first(scan, drone, Merge(zone_m=0.5, reach_m=0.1))
+    found = better(scan, drone, Merge(zone_m=0.5, reach_m=0.1))
     far = scan[:, 0] > 7.5
     assert found.kept_one[far].mean() < 0.1
     assert found.kept_one[scan[:, 0] < 6.0].all()
@@ -104,7 +109,7 @@ def test_a_zone_in_which_the_scanner_is_worse_goes_to_the_drone():
 
 def test_a_thin_scan_does_not_push_out_a_dense_drone_cloud():
     rng = np.random.default_rng(2)
-    found = better_first(wall(rng, 5, 60, 0.002), wall(rng, 5, 900, 0.012), QUICK)
+    found = better(wall(rng, 5, 60, 0.002), wall(rng, 5, 900, 0.012), QUICK)
     assert found.kept_other.all()
     assert found.kept_one.all()
 
@@ -131,7 +136,7 @@ def test_the_choice_knows_no_order_of_parts_or_points_and_no_offset(seam):
     scan, drone = seam
     parts = parts_of(scan, drone)
     kept = choose(parts, QUICK).kept
-    np.testing.assert_array_equal(kept[2], better_first(scan, drone, QUICK).kept_other)
+    np.testing.assert_array_equal(kept[2], better(scan, drone, QUICK).kept_other)
     np.testing.assert_array_equal(choose(parts[::-1], QUICK).kept[0], kept[2])
     turn = np.random.default_rng(3).permutation(len(drone))
     cloud = joined_pieces(parts[2].pieces).select(turn)
@@ -176,7 +181,7 @@ def test_one_kind_of_sensor_is_kept_whole(seam):
 
 def test_clouds_without_a_plane_are_kept_whole():
     rng = np.random.default_rng(4)
-    found = better_first(rng.uniform(0, 9, (500, 3)), rng.uniform(0, 9, (500, 3)), QUICK)
+    found = better(rng.uniform(0, 9, (500, 3)), rng.uniform(0, 9, (500, 3)), QUICK)
     assert found.kept_one.all()
     assert found.kept_other.all()
     assert "no flat zone" in found.note

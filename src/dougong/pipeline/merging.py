@@ -163,11 +163,6 @@ class Chosen:
     note: str = ""
 
 
-def better_first(one: Points, other: Points, params: Merge) -> Chosen:
-    """Return which points of two sensors' sets stay; (n, 3) and (m, 3), metres, one frame."""
-    return better_of(whole(one, other), params)
-
-
 def better_of(tiles: Tiles, params: Merge) -> Chosen:
     """Return which points of two sensors stay."""
     grid = grid_over((points for sides in tiles(0.0) for points in sides.points), params.zone_m)

@@ -38,10 +38,6 @@ class Levelling:
     """The level surfaces, too, are squarer to `up` than to z. False: leaning (battered) walls on
     level ground, which say nothing about the instrument."""
 
-    def proves_level(self, tolerance_deg: float) -> bool:
-        """Say whether the walls prove that z is vertical within `tolerance_deg` (2 sigma)."""
-        return self.tilt_deg + 2.0 * self.sigma_deg < tolerance_deg
-
     def is_tilted(self, tolerance_deg: float) -> bool:
         """Say whether the walls prove a tilt of more than `tolerance_deg` (4 sigma)."""
         is_explained_by_batter = self.battered >= self.support
