@@ -176,8 +176,9 @@ class Binder:
         block["row"] = row
         for name, values in columns.items():
             block[name] = values
-        numbers, starts = np.unique(row // PAGE_POINTS, return_index=True)
-        for number, part in zip(numbers.tolist(), np.split(block, starts[1:]), strict=True):
+        page = row // PAGE_POINTS
+        starts = np.flatnonzero(np.diff(page, prepend=-1))
+        for number, part in zip(page[starts].tolist(), np.split(block, starts[1:]), strict=True):
             path = self._path(number)
             with told(path), path.open("ab") as file:
                 np.save(file, part)

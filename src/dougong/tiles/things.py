@@ -25,7 +25,6 @@ SIZES = tuple(f"groups_{name}" for name in Sizes._fields)
 """What the tests leave of the groups of a tile."""
 LINKS = ("link_group", "link_tile", "link_place")
 """And of the links across its border: its group; the other's tile, and place there."""
-_OPEN = ("open_start", "open_group", "into")
 
 
 class _Groups(NamedTuple):
@@ -83,8 +82,11 @@ def _linked(folder: Folder, tiles: Sequence[Tile], tested: str) -> tuple[Index, 
 
 
 def _sizes_of(folder: Folder, tile: Tile, tested: str) -> Sizes:
-    held = read_arrays(folder, tile, tested, *SIZES)
-    return Sizes(*(held[name] for name in SIZES))
+    return _sizes_in(read_arrays(folder, tile, tested, *SIZES))
+
+
+def _sizes_in(held: Arrays) -> Sizes:
+    return Sizes._make(held[name] for name in SIZES)
 
 
 def _numbers_of(side: Index, found: Sequence[Index], start: Index) -> Index:
@@ -103,7 +105,7 @@ def link_pieces(job: Job) -> tuple[Arrays, Record]:
     """
     tested, file, reach = job.known
     held = read_file(job.folder, file)
-    sizes = Sizes(*(held[name] for name in SIZES))
+    sizes = _sizes_in(held)
     is_piece = are_pieces(sizes, sizes.are_large(reach))
 
     def pieces_of(tile: Tile) -> tuple[Points, Index]:
@@ -139,7 +141,7 @@ def things_of(
     most_beside: what was recorded with the groups; None where small things never count as large.
     """
     held = read_file(folder, file)
-    sizes = Sizes(*(held[name] for name in SIZES))
+    sizes = _sizes_in(held)
     pairs = np.concatenate([read_arrays(folder, tile, linked, "pairs")["pairs"] for tile in tiles])
     into = joined(len(sizes.held), pairs[:, 0], pairs[:, 1])
     things = protective.things_of(sizes.merged(into), reach_m, most_beside)
