@@ -11,6 +11,7 @@ from dougong._sorting import distinct
 from dougong.cloud import Cloud
 from dougong.errors import RegistrationError
 from dougong.filters.cloth_simulation import ClothSimulation, cloth_simulation
+from dougong.filters.curvature_weighted import CurvatureWeighted, curvature_weighted
 from dougong.filters.low_outliers import low_outliers
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid
 from dougong.params import Parameters
@@ -21,6 +22,11 @@ from dougong.registration.surface import surface
 from dougong.typing import Index, Kind, Mask, Points, Values
 
 MIN_POINTS = 100
+FEW_STRAYS = 0.02
+"""So few of the thinned points off every surface are not dropped: they outvote nothing, and among
+them are points of thin things."""
+_STRAYS = CurvatureWeighted(surface_loss=0.05)
+"""Sharper than the filter's own: a pose does not miss one point of a wall in a hundred."""
 
 
 class Prepare(Parameters):
@@ -112,6 +118,7 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
     _check_count(len(kept), cloud.name)
     sigma = sensor_noise(points[kept])
     kept = kept[_thin(points[kept], params)]
+    kept = _on_surfaces(points, kept, notes)
     xyz = points[kept]
     _check_count(len(xyz), cloud.name)
     plane = surface(xyz, params.normal_neighbours)
@@ -191,6 +198,22 @@ def _thin(points: Points, params: Prepare) -> Index:
             return np.flatnonzero(chosen).astype(np.int64)
         # Points lie on surfaces: their number falls with the square of the spacing.
         voxel *= max(1.05, 1.02 * np.sqrt(count / params.max_points))
+
+
+def _on_surfaces(points: Points, thinned: Index, notes: list[str]) -> Index:
+    """Return those of the `thinned` points that surfaces hold, where many are not.
+
+    Thinning keeps a stray alone in its voxel and one of the many points of a surface, so it gathers
+    strays, out of what was filtered too: 4 % of a flight were 11 % of its thinned cloud and half of
+    what the verdict heard.
+    """
+    strays = ~curvature_weighted(points[thinned], _STRAYS).is_kept
+    if strays.sum() <= FEW_STRAYS * len(thinned):
+        return thinned
+    notes.append(
+        f"{strays.sum():,} of {len(thinned):,} thinned points stand off every surface: dropped"
+    )
+    return thinned[~strays]
 
 
 def _check_tilt(upright: Levelling, params: Prepare, name: str, notes: list[str]) -> bool:
