@@ -66,7 +66,7 @@ def command(
         4: levelled, 6: rigid, 5 and 7: the same with a free scale; auto: 6 with a gravity prior,
         and the scale of photogrammetry that declares no unit.
     filtered
-        The inputs are clean already; nothing is dropped as noise.
+        The inputs are clean already; nothing is dropped as far, alone or below the ground.
     yaw_hint
         About how far SOURCE is turned about the vertical, degrees: picks among equal poses.
     pairs

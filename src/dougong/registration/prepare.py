@@ -39,7 +39,8 @@ class Prepare(Parameters):
     normal_neighbours: Annotated[int, Field(ge=4)] = 16
     """Points per local plane."""
     is_filtered: bool = False
-    """True: the cloud is clean already; nothing is dropped as far or isolated."""
+    """True: the cloud is clean already; nothing is dropped as far, isolated or below the ground.
+    Strays are, all the same: thinning gathers what a filter left."""
     tilt_tolerance_deg: Annotated[float, Field(gt=0)] = 0.6
     """Tilts up to this are left to the fine registration; larger ones that the walls prove are
     taken out before the ground is looked for."""
@@ -99,7 +100,8 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
     """Clean, thin and describe `cloud`; its own coordinates and records stay as they are.
 
     Drops points far from all others and isolated ones, thins to the working spacing (original
-    points, never averages), then finds noise, normals, the vertical and the ground.
+    points, never averages), drops strays where there are many, then finds noise, normals, the
+    vertical and the ground.
 
     Raises
     ------

@@ -30,7 +30,7 @@ class Register(Parameters):
     """Degrees of freedom: 4 levelled, 5 levelled with scale, 6 rigid, 7 rigid with scale; auto: 6
     with a gravity prior, and 7 where nothing declares a cloud's unit and it is not the metre."""
     filtered: bool = False
-    """The inputs are clean already: nothing is dropped before the search."""
+    """The inputs are clean already: nothing is dropped as far, alone or below the ground."""
     yaw_hint_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
     """Known turn from source to target about the vertical, within 15 degrees."""
     grid_scale: Literal["auto", "off"] | float = "auto"

@@ -182,7 +182,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def _plain(value: float, _place: int) -> str:
     """Return the label of a tick on a logarithmic axis: of 1, 2 and 5 times a power of ten."""
     lead = value / 10.0 ** np.floor(np.log10(value) + 1e-9)
-    return f"{value:,g}" if round(lead, 6) in (1.0, 2.0, 5.0) else ""
+    return f"{value:,.10g}" if round(lead, 6) in (1.0, 2.0, 5.0) else ""
 
 
 def draw_growth(table: Sequence[Mapping[str, Any]], path: Path) -> None:
