@@ -100,5 +100,5 @@ def notes_of(linked: Sequence[Linked]) -> list[str]:
     notes = [note for link in linked for source in link.mover.sources for note in source.notes]
     for link in linked:
         if link.result is not None:
-            notes += [f"{link.mover.name}: {note}" for note in link.result.notes]
+            notes += [f"registering {link.mover.name}: {note}" for note in link.result.notes]
     return list(dict.fromkeys(notes))
