@@ -3,8 +3,9 @@
     python benchmarks/network_stations.py [--place hall] [--stations 12] [--points 60000]
                                           [--seed 0] [--drone]
 
-Scans the place from every station, puts each station into a frame of its own (any yaw, up to 0.3
-deg off level, anywhere), and runs them as one project. Prints, per station, the status, the error
+Scans the place from every station, numbers the stations as on a walk from one to the next, as they
+are recorded, puts each into a frame of its own (any yaw, up to 0.3 deg off level, anywhere), and
+runs them as one project. Prints, per station, the status, the error
 against its true place (95 % of its own points, after the best rigid motion is NOT taken out: the
 reference stays where it is) and the largest loop error of its links.
 """
@@ -50,12 +51,13 @@ def stations_of(asked: argparse.Namespace, folder: Path) -> tuple[dict[str, np.n
         **options,
     )
     number = scene.lidar.attribute("station")
+    everything = scene.lidar.frame.to_file(scene.lidar.xyz)
+    scans = [everything[number == k] for k in np.unique(number[number >= 0])[: asked.stations]]
     rng = np.random.default_rng([asked.seed, 7])
     truth, entries = {}, []
-    for station in np.unique(number[number >= 0])[: asked.stations]:
-        name = f"station{station:02d}"
+    for station, of_walk in enumerate(walk([densest(xyz) for xyz in scans])):
+        name, xyz = f"station{station:02d}", scans[of_walk]
         T = own_frame(rng)
-        xyz = scene.lidar.frame.to_file(scene.lidar.xyz[number == station])
         write(Cloud.from_points(xyz @ T[:3, :3].T + T[:3, 3]), folder / f"{name}.laz")
         truth[name] = T
         entries.append({"name": name, "kind": "lidar", "files": [f"{name}.laz"]})
@@ -64,6 +66,22 @@ def stations_of(asked: argparse.Namespace, folder: Path) -> tuple[dict[str, np.n
         truth["drone"] = scene.truth.T_best
         entries.append({"name": "drone", "kind": "photogrammetry", "files": ["drone.laz"]})
     return truth, entries
+
+
+def densest(xyz: np.ndarray) -> np.ndarray:
+    """Return the square metre (2,) with most points: the scanner stands on it."""
+    cells, counts = np.unique(np.floor(xyz[:, :2]), axis=0, return_counts=True)
+    return cells[np.argmax(counts)] + 0.5
+
+
+def walk(places: list[np.ndarray]) -> list[int]:
+    """Return the order of a walk from the first place, always on to the nearest one left."""
+    order, left = [0], set(range(1, len(places)))
+    while left:
+        here = places[order[-1]]
+        order.append(min(left, key=lambda k: (float(np.linalg.norm(places[k] - here)), k)))
+        left.remove(order[-1])
+    return order
 
 
 def main() -> None:

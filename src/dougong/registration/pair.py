@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from dougong.cloud import Cloud, Frame
 from dougong.registration.checks import checks_document
 from dougong.registration.control import Control, local_control
 from dougong.registration.control_solve import ControlPoints
-from dougong.registration.decision import decide, refused
+from dougong.registration.decision import Found, decide, refused
 from dougong.registration.file_coordinates import in_file_coordinates, unit_of
 from dougong.registration.free_scale import ScaleSearch, Side, scale_near
 from dougong.registration.free_scale_control import find_scale, with_control
@@ -32,7 +32,7 @@ from dougong.registration.picked_pairs import (
     weigh,
     with_pairs,
 )
-from dougong.registration.prepare import Prepared, prepare
+from dougong.registration.prepare import Prepare, Prepared, prepare
 from dougong.registration.result import Hypothesis, Registration
 from dougong.registration.sanity import is_mirrored, propose_scale
 from dougong.registration.settings import Register
@@ -137,12 +137,22 @@ def _registered(
         none = refused(proposal.sentence)
         return in_file_coordinates(none, source, target, scale, params, clock, [])
     settings = params.prepare.model_copy(update={"is_filtered": params.filtered})
-    one, two = prepare(source, kinds[0], settings), prepare(target, kinds[1], settings)
+
+    def tried(one: Prepared, two: Prepared) -> _Tried:
+        clock.lap("prepare")
+        starts = _starts(one, two, (source.frame, target.frame), params, fit, surveyed)
+        clock.lap("coarse")
+        return _Tried(one, two, starts, decide(one, two, starts, params, clock, surveyed))
+
+    best = tried(*_prepared(source, target, kinds, settings))
+    if best.is_refused:
+        # Among many strays a true pose explains little: it is asked again without them.
+        without = settings.model_copy(update={"drops_strays": True})
+        one, two = _prepared(source, target, kinds, without)
+        again = tried(one, two) if one.strays + two.strays else best
+        best = best if again.is_refused else again
+    one, two, starts, found = best
     notes = [f"{c.name}: {n}" for c, p in ((source, one), (target, two)) for n in p.notes]
-    clock.lap("prepare")
-    starts = _starts(one, two, (source.frame, target.frame), params, fit, surveyed)
-    clock.lap("coarse")
-    found = decide(one, two, starts, params, clock, surveyed)
     is_judged = found.status == "ok" or found.reason == LEFT_SENTENCE
     if not is_judged and params.coarse in ("auto", "plan"):
         # Nothing was found to reflect: the mirror image is searched for from the start.
@@ -156,6 +166,26 @@ def _registered(
     if surveyed is not None:
         result = replace(result, checks=checks_document(surveyed, found.adjusted, found.T))
     return result if fit is None else with_pairs(result, fit)
+
+
+class _Tried(NamedTuple):
+    """Two prepared clouds, the poses they were heard with, and what came of it."""
+
+    one: Prepared
+    two: Prepared
+    starts: list[Hypothesis]
+    found: Found
+
+    @property
+    def is_refused(self) -> bool:
+        """True: no pose holds, for another reason than a left-handed file."""
+        return self.found.status == "failed" and self.found.reason != LEFT_SENTENCE
+
+
+def _prepared(
+    source: Cloud, target: Cloud, kinds: tuple[Kind, Kind], settings: Prepare
+) -> tuple[Prepared, Prepared]:
+    return prepare(source, kinds[0], settings), prepare(target, kinds[1], settings)
 
 
 def _starts(

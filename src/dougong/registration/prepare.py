@@ -11,7 +11,7 @@ from dougong._sorting import distinct
 from dougong.cloud import Cloud
 from dougong.errors import RegistrationError
 from dougong.filters.cloth_simulation import ClothSimulation, cloth_simulation
-from dougong.filters.curvature_weighted import CurvatureWeighted, curvature_weighted
+from dougong.filters.curvature_weighted import curvature_weighted
 from dougong.filters.low_outliers import low_outliers
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid
 from dougong.params import Parameters
@@ -22,11 +22,8 @@ from dougong.registration.surface import surface
 from dougong.typing import Index, Kind, Mask, Points, Values
 
 MIN_POINTS = 100
-FEW_STRAYS = 0.02
-"""So few of the thinned points off every surface are not dropped: they outvote nothing, and among
-them are points of thin things."""
-_STRAYS = CurvatureWeighted(surface_loss=0.05)
-"""Sharper than the filter's own: a pose does not miss one point of a wall in a hundred."""
+FEW_STRAYS = 0.05
+"""So few of the thinned points off every surface are not dropped: they outvote nothing."""
 
 
 class Prepare(Parameters):
@@ -39,8 +36,9 @@ class Prepare(Parameters):
     normal_neighbours: Annotated[int, Field(ge=4)] = 16
     """Points per local plane."""
     is_filtered: bool = False
-    """True: the cloud is clean already; nothing is dropped as far, isolated or below the ground.
-    Strays are, all the same: thinning gathers what a filter left."""
+    """True: the cloud is clean already; nothing is dropped as far, isolated or below the ground."""
+    drops_strays: bool = False
+    """True: thinned points off every surface are dropped, where they are more than 5 %."""
     tilt_tolerance_deg: Annotated[float, Field(gt=0)] = 0.6
     """Tilts up to this are left to the fine registration; larger ones that the walls prove are
     taken out before the ground is looked for."""
@@ -88,6 +86,8 @@ class Prepared:
     """What the walls say about z; `levelling.up` is trusted only where `is_relevelled`."""
     is_relevelled: bool = False
     """True: the walls proved a tilt, heights were measured along `up` instead of z."""
+    strays: int = 0
+    """Points off every surface that were dropped."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -100,8 +100,8 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
     """Clean, thin and describe `cloud`; its own coordinates and records stay as they are.
 
     Drops points far from all others and isolated ones, thins to the working spacing (original
-    points, never averages), drops strays where there are many, then finds noise, normals, the
-    vertical and the ground.
+    points, never averages), drops strays if asked, then finds noise, normals, the vertical and the
+    ground.
 
     Raises
     ------
@@ -119,8 +119,9 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
     kept = _clean(points, params, notes)
     _check_count(len(kept), cloud.name)
     sigma = sensor_noise(points[kept])
-    kept = kept[_thin(points[kept], params)]
-    kept = _on_surfaces(points, kept, notes)
+    kept = thinned = kept[_thin(points[kept], params)]
+    if params.drops_strays:
+        kept = _on_surfaces(points, thinned, notes)
     xyz = points[kept]
     _check_count(len(xyz), cloud.name)
     plane = surface(xyz, params.normal_neighbours)
@@ -163,6 +164,7 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
         has_ground=ground.is_found,
         levelling=upright,
         is_relevelled=is_relevelled,
+        strays=len(thinned) - len(kept),
         notes=tuple(notes),
     )
 
@@ -206,11 +208,13 @@ def _on_surfaces(points: Points, thinned: Index, notes: list[str]) -> Index:
     """Return those of the `thinned` points that surfaces hold, where many are not.
 
     Thinning keeps a stray alone in its voxel and one of the many points of a surface, so it gathers
-    strays, out of what was filtered too: 4 % of a flight were 11 % of its thinned cloud and half of
-    what the verdict heard.
+    strays, also those that a filter left: 4 % of a flight were 11 % of its thinned cloud and half
+    of what the verdict heard. Where strays are few, the rule takes as much that holds the pose (a
+    gate, steps): asked of every pair, it made one in ten of the right answers ambiguous.
     """
-    strays = ~curvature_weighted(points[thinned], _STRAYS).is_kept
-    if strays.sum() <= FEW_STRAYS * len(thinned):
+    strays = ~curvature_weighted(points[thinned]).is_kept
+    left = len(thinned) - int(strays.sum())
+    if left >= (1.0 - FEW_STRAYS) * len(thinned) or left < MIN_POINTS:
         return thinned
     notes.append(
         f"{strays.sum():,} of {len(thinned):,} thinned points stand off every surface: dropped"
