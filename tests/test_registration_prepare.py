@@ -8,7 +8,7 @@ from dougong.cloud import Cloud
 from dougong.errors import RegistrationError
 from dougong.registration.cleaning import far_points, isolated_points, sensor_noise
 from dougong.registration.levelling import levelling, rotation_to_vertical
-from dougong.registration.prepare import Prepare, prepare
+from dougong.registration.prepare import Prepare, describe, prepare, thin
 from registration_sites import L_PLAN, SETTINGS, as_cloud, motion, moved, site, walls
 
 
@@ -52,15 +52,14 @@ def test_strays_beside_the_surfaces_are_dropped_where_there_are_many(clean):
     strays = clean[rng.integers(0, len(clean), count)] + rng.normal(0, 1.5, (count, 3))
     cloud = as_cloud(np.vstack([clean, strays]))
     is_stray = {tuple(point) for point in cloud.xyz[len(clean) :]}
-    asked = SETTINGS.model_copy(update={"drops_strays": True})
-    found = prepare(cloud, "photogrammetry", asked)
+    thinned, undisturbed = (thin(each, SETTINGS) for each in (cloud, as_cloud(clean)))
+    found = describe(thinned.without_strays(), "photogrammetry", SETTINGS)
     left = sum(tuple(point) in is_stray for point in found.xyz)
-    undisturbed = prepare(as_cloud(clean), "photogrammetry", asked)
-    assert undisturbed.strays == 0 < found.strays
+    assert undisturbed.without_strays() is undisturbed
     assert left < 0.2 * count
-    assert len(found.xyz) - left > 0.95 * len(undisturbed.xyz)
+    assert len(found.xyz) - left > 0.95 * len(undisturbed.kept)
     assert any("stand off every surface: dropped" in note for note in found.notes)
-    assert prepare(cloud, "photogrammetry", SETTINGS).strays == 0
+    assert not any("stand off" in note for note in prepare(cloud, "lidar", SETTINGS).notes)
 
 
 def test_order_and_origin_play_no_part(clean):

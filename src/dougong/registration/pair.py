@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
@@ -32,7 +33,7 @@ from dougong.registration.picked_pairs import (
     weigh,
     with_pairs,
 )
-from dougong.registration.prepare import Prepare, Prepared, prepare
+from dougong.registration.prepare import Prepared, Thinned, describe, thin
 from dougong.registration.result import Hypothesis, Registration
 from dougong.registration.sanity import is_mirrored, propose_scale
 from dougong.registration.settings import Register
@@ -138,18 +139,19 @@ def _registered(
         return in_file_coordinates(none, source, target, scale, params, clock, [])
     settings = params.prepare.model_copy(update={"is_filtered": params.filtered})
 
-    def tried(one: Prepared, two: Prepared) -> _Tried:
+    def tried(thinned: Sequence[Thinned]) -> _Tried:
+        one, two = (describe(*each, settings) for each in zip(thinned, kinds, strict=True))
         clock.lap("prepare")
         starts = _starts(one, two, (source.frame, target.frame), params, fit, surveyed)
         clock.lap("coarse")
         return _Tried(one, two, starts, decide(one, two, starts, params, clock, surveyed))
 
-    best = tried(*_prepared(source, target, kinds, settings))
+    thinned = [thin(cloud, settings) for cloud in (source, target)]
+    best = tried(thinned)
     if best.is_refused:
         # Among many strays a true pose explains little: it is asked again without them.
-        without = settings.model_copy(update={"drops_strays": True})
-        one, two = _prepared(source, target, kinds, without)
-        again = tried(one, two) if one.strays + two.strays else best
+        without = [cloud.without_strays() for cloud in thinned]
+        again = tried(without) if without != thinned else best
         best = best if again.is_refused else again
     one, two, starts, found = best
     notes = [f"{c.name}: {n}" for c, p in ((source, one), (target, two)) for n in p.notes]
@@ -180,12 +182,6 @@ class _Tried(NamedTuple):
     def is_refused(self) -> bool:
         """True: no pose holds, for another reason than a left-handed file."""
         return self.found.status == "failed" and self.found.reason != LEFT_SENTENCE
-
-
-def _prepared(
-    source: Cloud, target: Cloud, kinds: tuple[Kind, Kind], settings: Prepare
-) -> tuple[Prepared, Prepared]:
-    return prepare(source, kinds[0], settings), prepare(target, kinds[1], settings)
 
 
 def _starts(

@@ -1,6 +1,6 @@
 """Make a cloud ready for registration: the same few facts about every cloud, raw or filtered."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -37,8 +37,6 @@ class Prepare(Parameters):
     """Points per local plane."""
     is_filtered: bool = False
     """True: the cloud is clean already; nothing is dropped as far, isolated or below the ground."""
-    drops_strays: bool = False
-    """True: thinned points off every surface are dropped, where they are more than 5 %."""
     tilt_tolerance_deg: Annotated[float, Field(gt=0)] = 0.6
     """Tilts up to this are left to the fine registration; larger ones that the walls prove are
     taken out before the ground is looked for."""
@@ -49,6 +47,35 @@ class Prepare(Parameters):
     min_ground_share: Annotated[float, Field(ge=0, le=1)] = 0.03
     """Less ground than this share of the occupied plan area: heights are counted from the
     lowest points instead, and a note says so."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Thinned:
+    """A cloud cleaned and thinned, before anything is said of its surfaces."""
+
+    cloud: Cloud
+    kept: Index
+    """(n,) which of its points are left."""
+    sigma_m: float
+    """Noise of one measured point across its surface (one standard deviation)."""
+    notes: tuple[str, ...]
+
+    def without_strays(self) -> "Thinned":
+        """Return the cloud without points off every surface; itself where these are few.
+
+        Thinning keeps a stray alone in its voxel and one of the many points of a surface, so it
+        gathers strays, also those that a filter left: 4 % of a flight were 11 % of its thinned
+        cloud and half of what the verdict heard. Where strays are few, the rule takes as much that
+        holds the pose (a gate, steps): asked of every pair, it made one in ten of the right answers
+        ambiguous.
+        """
+        points = as_points(self.cloud.xyz)
+        strays = ~curvature_weighted(points[self.kept]).is_kept
+        count, left = len(self.kept), len(self.kept) - int(strays.sum())
+        if left >= (1.0 - FEW_STRAYS) * count or left < MIN_POINTS:
+            return self
+        note = f"{strays.sum():,} of {count:,} thinned points stand off every surface: dropped"
+        return replace(self, kept=self.kept[~strays], notes=(*self.notes, note))
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True, kw_only=True, eq=False)
@@ -86,8 +113,6 @@ class Prepared:
     """What the walls say about z; `levelling.up` is trusted only where `is_relevelled`."""
     is_relevelled: bool = False
     """True: the walls proved a tilt, heights were measured along `up` instead of z."""
-    strays: int = 0
-    """Points off every surface that were dropped."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -100,8 +125,7 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
     """Clean, thin and describe `cloud`; its own coordinates and records stay as they are.
 
     Drops points far from all others and isolated ones, thins to the working spacing (original
-    points, never averages), drops strays if asked, then finds noise, normals, the vertical and the
-    ground.
+    points, never averages), then finds noise, normals, the vertical and the ground.
 
     Raises
     ------
@@ -113,16 +137,25 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
     Deterministic; independent of the order of the points and of the origin of the frame.
     """
     params = params or Prepare()
+    return describe(thin(cloud, params), kind, params)
+
+
+def thin(cloud: Cloud, params: Prepare) -> Thinned:
+    """Clean and thin `cloud`, the first half of `prepare`."""
     points = as_points(cloud.xyz)
     _check_count(len(points), cloud.name)
     notes: list[str] = []
     kept = _clean(points, params, notes)
     _check_count(len(kept), cloud.name)
     sigma = sensor_noise(points[kept])
-    kept = thinned = kept[_thin(points[kept], params)]
-    if params.drops_strays:
-        kept = _on_surfaces(points, thinned, notes)
-    xyz = points[kept]
+    kept = kept[_thin(points[kept], params)]
+    return Thinned(cloud=cloud, kept=kept, sigma_m=sigma, notes=tuple(notes))
+
+
+def describe(thinned: Thinned, kind: Kind, params: Prepare) -> Prepared:
+    """Find normals, the vertical and the ground of a thinned cloud, the other half of `prepare`."""
+    cloud, kept, sigma, notes = thinned.cloud, thinned.kept, thinned.sigma_m, [*thinned.notes]
+    xyz = as_points(cloud.xyz)[kept]
     _check_count(len(xyz), cloud.name)
     plane = surface(xyz, params.normal_neighbours)
     spacing = plane.spacing_m
@@ -164,7 +197,6 @@ def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared
         has_ground=ground.is_found,
         levelling=upright,
         is_relevelled=is_relevelled,
-        strays=len(thinned) - len(kept),
         notes=tuple(notes),
     )
 
@@ -202,24 +234,6 @@ def _thin(points: Points, params: Prepare) -> Index:
             return np.flatnonzero(chosen).astype(np.int64)
         # Points lie on surfaces: their number falls with the square of the spacing.
         voxel *= max(1.05, 1.02 * np.sqrt(count / params.max_points))
-
-
-def _on_surfaces(points: Points, thinned: Index, notes: list[str]) -> Index:
-    """Return those of the `thinned` points that surfaces hold, where many are not.
-
-    Thinning keeps a stray alone in its voxel and one of the many points of a surface, so it gathers
-    strays, also those that a filter left: 4 % of a flight were 11 % of its thinned cloud and half
-    of what the verdict heard. Where strays are few, the rule takes as much that holds the pose (a
-    gate, steps): asked of every pair, it made one in ten of the right answers ambiguous.
-    """
-    strays = ~curvature_weighted(points[thinned]).is_kept
-    left = len(thinned) - int(strays.sum())
-    if left >= (1.0 - FEW_STRAYS) * len(thinned) or left < MIN_POINTS:
-        return thinned
-    notes.append(
-        f"{strays.sum():,} of {len(thinned):,} thinned points stand off every surface: dropped"
-    )
-    return thinned[~strays]
 
 
 def _check_tilt(upright: Levelling, params: Prepare, name: str, notes: list[str]) -> bool:
