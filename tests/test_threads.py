@@ -1,8 +1,66 @@
 """Blocks are fanned out whole, in fixed pieces, and errors come back."""
 
+import threading
+
 import pytest
 
 from dougong import threads
+
+
+@pytest.fixture(params=[1, 3])
+def workers(request):
+    before = threads.get_threads()
+    threads.set_threads(request.param)
+    yield request.param
+    threads.set_threads(before)
+
+
+def test_items_made_ahead_come_in_order(workers):
+    assert list(threads.ahead(iter(range(50)))) == list(range(50))
+    assert list(threads.ahead([])) == []
+
+
+def test_an_error_of_the_source_is_raised_behind_what_came_before_it(workers):
+    def source():
+        yield 1
+        raise ZeroDivisionError
+
+    items = threads.ahead(source())
+    assert next(items) == 1
+    with pytest.raises(ZeroDivisionError):
+        next(items)
+
+
+def test_whoever_stops_early_lets_the_source_close_its_files(workers):
+    closed = []
+
+    def source():
+        try:
+            yield from range(50)
+        finally:
+            closed.append(True)
+
+    items = threads.ahead(source())
+    assert next(items) == 0
+    items.close()
+    assert closed == [True]
+
+
+def test_the_next_item_is_made_while_one_is_used():
+    before = threads.get_threads()
+    threads.set_threads(2)
+    is_made = threading.Event()
+
+    def source():
+        yield "first"
+        is_made.set()
+        yield "second"
+
+    try:
+        for item in threads.ahead(source()):
+            assert is_made.wait(10.0), item
+    finally:
+        threads.set_threads(before)
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 100])

@@ -43,6 +43,7 @@ def test_tiles_keep_what_the_whole_keeps(tmp_path, params, chunk, tile_points):
     np.testing.assert_array_equal(count, whole.attributes["voxel_count"][whole.is_kept])
     assert tiled.facts["points_in"] == len(cloud)
     assert tuple(tiled.facts["faults"]) == faults_of(cloud)
+    spool.remove()
     assert len(list(tmp_path.iterdir())) == len(tiled.tiles) + 1
 
 
@@ -115,30 +116,45 @@ def test_a_cloud_is_cut_at_once_as_halving_crowded_tiles_would(far):
         np.testing.assert_array_equal(mine, wanted[np.isin(wanted, some)])
 
 
-def test_rows_come_back_bit_for_bit(tmp_path):
-    cloud = site(300)
-    file = RowFile(tmp_path / "a.rows", cloud.records.dtype)
-    for a, b in ((0, 100), (100, 101), (101, len(cloud))):
-        file.append(Rows(np.arange(a, b), cloud.xyz[a:b], cloud.records[a:b]))
+@pytest.mark.parametrize("is_thinned", [True, False])
+def test_rows_come_back_bit_for_bit(tmp_path, is_thinned):
+    xyz = site(300).xyz
+    counts = np.arange(len(xyz), dtype=np.int32) if is_thinned else None
+    rows = Rows(np.arange(len(xyz)), xyz, counts)
+    file = RowFile(tmp_path / "a.rows", is_thinned=is_thinned)
+    for a, b in ((0, 100), (100, 101), (101, len(xyz))):
+        file.append(rows.take(np.arange(a, b)))
     back = file.read()
     assert len(list(file.pieces())) == 3
-    np.testing.assert_array_equal(np.concatenate(list(file.coordinates())), cloud.xyz)
-    np.testing.assert_array_equal(back.row, np.arange(len(cloud)))
-    np.testing.assert_array_equal(back.xyz, cloud.xyz)
-    assert back.records.tobytes() == cloud.records.tobytes()
+    np.testing.assert_array_equal(np.concatenate(list(file.coordinates())), xyz)
+    np.testing.assert_array_equal(back.row, rows.row)
+    np.testing.assert_array_equal(back.xyz, xyz)
+    np.testing.assert_array_equal(back.stands_for, counts)
+
+
+def test_a_cloud_on_disk_comes_back_bit_for_bit(tmp_path):
+    cloud = site(300)
+    spool = Spool(pieces(cloud, 101), tmp_path)
+    back = list(spool.pieces())
+    assert [len(piece) for piece in back] == [len(piece) for piece in pieces(cloud, 101)]
+    assert spool.points == len(cloud)
+    np.testing.assert_array_equal(np.concatenate([piece.xyz for piece in back]), cloud.xyz)
+    assert b"".join(piece.records.tobytes() for piece in back) == cloud.records.tobytes()
+    some = np.array([7, 5, 250])
+    assert spool.records_at(some).tobytes() == cloud.records[some].tobytes()
 
 
 def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path):
-    cloud = site(100)
-    file = RowFile(tmp_path / "missing" / "a.rows", cloud.records.dtype)
+    xyz = site(100).xyz
+    file = RowFile(tmp_path / "missing" / "a.rows", is_thinned=False)
     with pytest.raises(OutputError, match="could not be written"):
-        file.append(Rows(np.arange(len(cloud)), cloud.xyz, cloud.records))
+        file.append(Rows(np.arange(len(xyz)), xyz))
 
 
 def test_a_file_that_was_cut_short_is_no_cloud(tmp_path):
-    cloud = site(100)
-    file = RowFile(tmp_path / "a.rows", cloud.records.dtype)
-    file.append(Rows(np.arange(len(cloud)), cloud.xyz, cloud.records))
+    xyz = site(100).xyz
+    file = RowFile(tmp_path / "a.rows", is_thinned=False)
+    file.append(Rows(np.arange(len(xyz)), xyz))
     with file.path.open("r+b") as stored:
         stored.truncate(file.path.stat().st_size - 1)
     with pytest.raises(OutputError, match="cut short"):

@@ -5,8 +5,11 @@ do not depend on the thread count, so neither does any result, and Ctrl-C works 
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar, cast
+
+Item = TypeVar("Item")
 
 _threads = max(
     1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -42,3 +45,25 @@ def for_blocks(count: int, block: int, task: Callable[[int, int], None]) -> None
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def ahead(items: Iterable[Item]) -> Iterator[Item]:
+    """Yield `items`, each made in another thread while its predecessor is used.
+
+    One more item is held. With one thread they are made as they are asked for.
+    """
+    source = iter(items)
+    if _threads == 1:
+        yield from source
+        return
+    end = object()
+    with ThreadPoolExecutor(1) as worker:
+        try:
+            coming = worker.submit(next, source, cast(Item, end))
+            while (item := coming.result()) is not end:
+                coming = worker.submit(next, source, cast(Item, end))
+                yield item
+        finally:
+            # Whoever stops early lets the source close its files, in the thread that runs it.
+            if isinstance(source, Generator):
+                worker.submit(source.close).result()

@@ -5,6 +5,7 @@ on their order. Kernels are imported when called: the model loads without Numba.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from pydantic import Field, model_validator
 
 from dougong._boxes import are_within, corners_of
 from dougong._checks import as_points
+from dougong.cloud import chosen_rows
 from dougong.errors import InputError
 from dougong.filters.selection import Selection
 from dougong.params import Parameters
@@ -165,7 +167,7 @@ def octree_voxel_grid(
     points: ArrayLike,
     params: OctreeVoxelGrid | None = None,
     *,
-    records: NDArray[Any] | None = None,
+    records: NDArray[Any] | Callable[[Index], NDArray[Any]] | None = None,
     root: Root | None = None,
 ) -> Selection:
     """Choose the point nearest the centre of every occupied voxel.
@@ -177,8 +179,8 @@ def octree_voxel_grid(
     points : array_like, shape (n, 3)
         Metres, local frame. Points outside the root cube fall into voxels of the same grid.
     params : OctreeVoxelGrid
-    records : ndarray, shape (n,), optional
-        Structured; tells points apart that share one place.
+    records : ndarray, shape (n,), or callable, optional
+        Structured; tells points apart that share one place. A callable returns those at `places`.
     root : Root, optional
         Of the whole cloud, where `points` are a part of it.
 
@@ -196,7 +198,7 @@ def octree_voxel_grid(
     params = params or OctreeVoxelGrid()
     xyz = as_points(points)
     n = len(xyz)
-    if records is not None and len(records) != n:
+    if isinstance(records, np.ndarray) and len(records) != n:
         raise InputError(f"records must hold one record per point, got {len(records)} for {n}.")
     if n == 0:
         return Selection(
@@ -215,7 +217,8 @@ def octree_voxel_grid(
 
     for_blocks(runs, 1 << 16, task)
     if records is not None and (twins > 1).any():
-        _settle_twins(xyz, records, places, run_starts, twins > 1, chosen)
+        records_at = records if callable(records) else partial(chosen_rows, records)
+        _settle_twins(xyz, records_at, places, run_starts, twins > 1, chosen)
     is_kept = np.zeros(n, bool)
     is_kept[chosen] = True
     return Selection(is_kept=is_kept, attributes={"voxel_count": counts.astype(np.int32)})
@@ -257,7 +260,7 @@ def runs_of_cells(xyz: Points, low: NDArray[np.float64], voxel_m: float) -> tupl
 
 def _settle_twins(
     xyz: Points,
-    records: NDArray[Any],
+    records_at: Callable[[Index], NDArray[Any]],
     places: Index,
     run_starts: Index,
     has_twins: NDArray[np.bool_],
@@ -269,7 +272,7 @@ def _settle_twins(
     run_of, candidates = run_of[is_same], places[is_same]
     is_same = (xyz[candidates] == xyz[chosen[run_of]]).all(axis=1)
     run_of, candidates = run_of[is_same], candidates[is_same]
-    held = np.ascontiguousarray(records[candidates])
+    held = np.ascontiguousarray(records_at(candidates))
     as_bytes = held.view(np.uint8).reshape(len(held), -1).view(f"S{held.dtype.itemsize}")[:, 0]
     _, ranks = np.unique(as_bytes, return_inverse=True)
     first = np.lexsort((candidates, ranks, run_of))

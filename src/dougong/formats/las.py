@@ -95,8 +95,9 @@ def _points(path: Path) -> Iterator[tuple[LasHeader, Any]]:
         def take(count: int) -> Records:
             nonlocal done
             try:
-                buffer = bytearray(count * header.point_bytes)
-            except (MemoryError, OverflowError) as error:
+                # Not zeroed, unlike a bytearray, which costs a tenth of decoding.
+                buffer = np.empty(count * header.point_bytes, dtype=np.uint8)
+            except (MemoryError, ValueError) as error:
                 raise _too_large(path, header) from error
             if decoder is None:
                 got = file.readinto(buffer) // header.point_bytes  # type: ignore[attr-defined]
@@ -108,7 +109,7 @@ def _points(path: Path) -> Iterator[tuple[LasHeader, Any]]:
                 except Undecodable as error:
                     raise damaged(path, header, readable_points(path, header)) from error
             done += count
-            records: Records = np.frombuffer(buffer, dtype=header.dtype)
+            records: Records = buffer.view(header.dtype)
             return records
 
         yield header, take

@@ -9,6 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dougong.errors import FormatError
 from dougong.formats.las_header import LasHeader
 
@@ -97,7 +100,7 @@ def _lazrs_errors() -> Iterator[None]:
         raise Undecodable from error
 
 
-def decode(decoder: Any, buffer: bytearray) -> None:
+def decode(decoder: Any, buffer: bytearray | NDArray[np.uint8]) -> None:
     """Fill `buffer` with the next points, or raise Undecodable."""
     with _lazrs_errors():
         decoder.decompress_many(buffer)

@@ -341,6 +341,7 @@ def write_las_records(
     from dougong.formats.atomic import replacing
     from dougong.formats.copc import HELD_POINTS, CopcWriter
     from dougong.formats.las_write import LasWriter
+    from dougong.threads import ahead
 
     # Compressed points take about half; only named in the message of a full disk.
     expected = header.point_bytes * points // (1 if family == ".las" else 2)
@@ -351,6 +352,6 @@ def write_las_records(
             writer = CopcWriter(sink, header, scratch=scratch, most_points=most)
         else:
             writer = LasWriter(sink, header, is_compressed=family == ".laz")
-        for records in pieces:
+        for records in ahead(pieces):
             writer.append(records)
         writer.close()

@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,10 @@ from dougong.pipeline.tiled import (
     stations_of,
     tiled_job,
 )
+from dougong.threads import ahead
 from dougong.tiles.folder import Folder, LocalFolder
 from dougong.tiles.shared import copies_in
+from dougong.tiles.spool import remove_spool
 from dougong.typing import Kind
 
 Document = dict[str, Any]
@@ -150,9 +153,9 @@ def filter_file(
         if is_too_large(input, room, 0):
             progress.note(f"{input.name} is larger than memory: it is filtered on tiles")
             with clock.measure("filter"):
-                books = _filtered_on_tiles(input, job, room, places, progress)
+                books, again = _filtered_on_tiles(input, job, room, places, progress)
             hold = Hold(room.held_points(), output.parent)
-            result = _pieces(input, job, books, mark)
+            result = _pieces(again, job, books, mark)
         else:
             with clock.measure("read"):
                 cloud = read(input)
@@ -194,22 +197,29 @@ def _places(output: Path, work: Folder | None, facts: str) -> Iterator[tuple[Fol
         output.with_name(f"tiles-{output.name}-{os.getpid() if work is None else key}")
     )
     folder = beside if work is None else work / name
+    scratch = folder.local or beside.path / "cut"
     try:
         with copies_in(beside.path / "copies"):
-            yield folder, folder.local or beside.path / "cut"
+            yield folder, scratch
     finally:
+        remove_spool(scratch)
         beside.remove()
 
 
-def _pieces(input: Path, job: FilterJob, books: Books, mark: bool) -> Pieces:
-    """Return what is written of a cloud that was filtered on tiles, as it is decoded again."""
+def _pieces(cloud: Pieces, job: FilterJob, books: Books, mark: bool) -> Pieces:
+    """Return what is written of a cloud that was filtered on tiles and comes once more."""
 
     def pieces() -> Iterator[Cloud]:
-        (chunks,) = stations_of(input, split=False)
-        for chunk, part in books.along(chunks):
+        for chunk, part in books.along(ahead(cloud())):
             yield _chosen(job, chunk, part, mark)
 
     return pieces
+
+
+def _decoded(input: Path) -> Iterator[Cloud]:
+    """Return the chunks of a file, all its scans as one cloud."""
+    (chunks,) = stations_of(input, split=False)
+    return chunks
 
 
 def _filter_document(job: FilterJob, books: Books, written: int, mark: bool) -> Document:
@@ -242,10 +252,10 @@ def _filter_document(job: FilterJob, books: Books, written: int, mark: bool) -> 
 
 def _filtered_on_tiles(
     input: Path, job: FilterJob, room: Room, places: tuple[Folder, Path], progress: Progress
-) -> Books:
-    (chunks,) = stations_of(input, split=False)
-    return filter_chunks(
-        chunks,
+) -> tuple[Books, Pieces]:
+    """Return what was decided about every point of the file, and its points once more."""
+    books, spool = filter_chunks(
+        _decoded(input),
         job.tiled(),
         points=describe(input).points,
         room=room,
@@ -254,6 +264,7 @@ def _filtered_on_tiles(
         scratch=places[1],
         progress=progress,
     )
+    return books, partial(_decoded, input) if spool is None else spool.pieces
 
 
 def reason_table(tally: Tally) -> dict[str, dict[str, Any]]:

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from dougong.cloud import Cloud, Frame, Pieces
-from dougong.tiles.store import RowFile, Rows, make_row_file
-
-_NOBODY = np.arange(0)
+from dougong.tiles.store import CloudFile
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,7 +28,13 @@ class Kept:
     @classmethod
     def of(cls, cloud: Cloud) -> Kept:
         """Return a cloud that is held."""
-        return cls(first=cloud.select(_NOBODY), points=len(cloud), pieces=lambda: (cloud,))
+        return cls(first=cloud.select(np.arange(0)), points=len(cloud), pieces=lambda: (cloud,))
+
+    @classmethod
+    def on_disk(cls, file: CloudFile) -> Kept:
+        """Return a cloud of at least one piece that is on disk."""
+        assert file.first is not None
+        return cls(first=file.first, points=file.points, pieces=file.pieces, is_held=False)
 
     @property
     def frame(self) -> Frame:
@@ -42,44 +45,6 @@ class Kept:
     def name(self) -> str:
         """Name of the file, or of the station."""
         return self.first.name
-
-
-class KeptFile:
-    """Kept points on their way to disk."""
-
-    def __init__(self, folder: Path) -> None:
-        self._make = make_row_file(folder)
-        self._file: RowFile | None = None
-        self._first: Cloud | None = None
-        self._points = 0
-
-    def add(self, piece: Cloud) -> None:
-        """Write a piece behind those that are there.
-
-        Raises
-        ------
-        OutputError
-            The disk is full, or the folder cannot be written.
-        """
-        if self._file is None or self._first is None:
-            self._first = piece.select(_NOBODY)
-            self._file = self._make("kept", piece.records.dtype)
-            self._file.path.unlink(missing_ok=True)
-        rows = np.arange(self._points, self._points + len(piece))
-        self._file.append(Rows(rows, piece.xyz, piece.records))
-        self._points += len(piece)
-
-    def finished(self) -> Kept:
-        """Return what was written, at least one piece."""
-        file, first = self._file, self._first
-        assert file is not None
-        assert first is not None
-
-        def pieces() -> Iterator[Cloud]:
-            for rows in file.pieces():
-                yield replace(first, xyz=rows.xyz, records=rows.records)
-
-        return Kept(first=first, points=self._points, pieces=pieces, is_held=False)
 
 
 def batches(pieces: Iterable[Cloud], most: int) -> Iterator[list[Cloud]]:

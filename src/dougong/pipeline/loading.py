@@ -157,39 +157,38 @@ class Loader:
         points = describe(file).points
         for station, raw in enumerate(stations_of(file, split=not entry.registered)):
             key = self._key(entry, digest, station)
-            if self.store.load(key) is not None:
-                self._say_known(file.stem)
-                continue
             name = f"tiles-{self._tiles_key(entry, digest, station)}"
             folder, scratch = self.store.folder / name, self.scratch / name
-            with self.clock.measure("filter"):
-                books = filter_chunks(
-                    (self._placed(entry, chunk) for chunk in raw),
-                    job,
-                    points=points,
-                    room=self.room,
-                    waiting=self.waiting,
-                    folder=folder,
-                    scratch=scratch,
-                    progress=self.progress,
-                )
-            self.store.save(key, books)
-            shutil.rmtree(scratch, ignore_errors=True)
-            if self.store.is_temporary:
-                folder.remove()
-        for station, raw in enumerate(stations_of(file, split=not entry.registered)):
-            key = self._key(entry, digest, station)
+            chunks = (self._placed(entry, chunk) for chunk in raw)
+            spool = None
+            if self.store.load(key) is not None:
+                self._say_known(file.stem)
+            else:
+                with self.clock.measure("filter"):
+                    books, spool = filter_chunks(
+                        chunks,
+                        job,
+                        points=points,
+                        room=self.room,
+                        waiting=self.waiting,
+                        folder=folder,
+                        scratch=scratch,
+                        progress=self.progress,
+                    )
+                self.store.save(key, books)
+                if self.store.is_temporary:
+                    folder.remove()
             known = self.store.load(key)
             assert known is not None
             self.progress.stage(f"{file.stem}: reading what is left")
             with self.clock.measure("read"):
-                chunks = (self._placed(entry, chunk) for chunk in raw)
                 kept, removed = spooled(
-                    chunks,
+                    chunks if spool is None else spool.pieces(),
                     known,
                     self.scratch / f"kept-{key[:16]}",
                     lambda part: self._kept(entry, part),
                 )
+            shutil.rmtree(scratch, ignore_errors=True)
             yield self._source(entry, file, station, kept, known, removed)
 
     def _kept(self, entry: Entry, filtered: Filtered) -> Cloud:

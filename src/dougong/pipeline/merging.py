@@ -31,6 +31,7 @@ from dougong.formats.model import Hold
 from dougong.params import Parameters
 from dougong.pipeline.sides import HALO_SHARE, Tiles, cut, whole
 from dougong.pipeline.zones import Zones, ZoneSums, grid_over
+from dougong.threads import ahead
 from dougong.typing import Index, Kind, Mask, Points, Values
 
 _QUIETER = 0.67
@@ -165,9 +166,11 @@ class Chosen:
 
 def better_of(tiles: Tiles, params: Merge) -> Chosen:
     """Return which points of two sensors stay."""
-    grid = grid_over((points for sides in tiles(0.0) for points in sides.points), params.zone_m)
+    grid = grid_over(
+        (points for sides in ahead(tiles(0.0)) for points in sides.points), params.zone_m
+    )
     sums, kept = (ZoneSums(grid), ZoneSums(grid)), [0, 0]
-    for sides in tiles(0.0):
+    for sides in ahead(tiles(0.0)):
         for side in (0, 1):
             kept[side] += len(sides.rows[side])
             if len(sides.rows[side]):
@@ -188,7 +191,7 @@ def better_of(tiles: Tiles, params: Merge) -> Chosen:
         params=params,
     )
     reach = params.reach_m or _reach(tiles, good, rule)
-    for sides in tiles(2.0 * reach):
+    for sides in ahead(tiles(2.0 * reach)):
         lost = _lost(sides.points[good], sides.points[1 - good], reach, rule)
         for side, is_lost in ((good, lost[0]), (1 - good, lost[1])):
             own = sides.rows[side]
@@ -241,7 +244,7 @@ def _reach(tiles: Tiles, good: int, rule: _Rule) -> float:
     """Return how far across the surface the two clouds lie from each other, with noise."""
     # Whole micrometres are counted: exact whatever the tiles, and nothing is held.
     counts = np.zeros(int(_LOOK_M / _MICRON) + 2, np.int64)
-    for sides in tiles(_LOOK_M):
+    for sides in ahead(tiles(_LOOK_M)):
         across = _across(sides.points[good], sides.own(1 - good), rule)
         counts += np.bincount(np.rint(across / _MICRON).astype(np.int64), minlength=len(counts))
     if not counts.any():

@@ -23,8 +23,11 @@ Way = Literal["in memory", "on tiles", "too large"]
 _READ, _TILES, _WRITE, _MERGE, _HASH = 0.6, 1.2, 1.4, 1.5, 0.4
 _FILTER = {"lidar": 3.6, "photogrammetry": 3.9}
 _PAIR_SECONDS, _DISTANCE_SECONDS, _REPORT_SECONDS = 20.0, 4.0, 5.0
-_SPOOL_ROW_BYTES = 32
-"""Of a point on disk beside its record: its place and its coordinates."""
+_SPOOL_ROW_BYTES = 24
+"""Of a point on disk beside its record: its coordinates."""
+_CUT_ROW_BYTES = 76
+"""Of a point on disk besides, while it is cut or filtered: in two cuts, or in its tile with what
+the filters said of it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,7 +119,7 @@ def _filter_stage(file: PlannedFile, row: int, waiting: int, kept_bytes: int) ->
         name=f"filter {file.cloud}",
         tiles=_tiles(file.points, file.tile_points),
         memory_bytes=tiles_bytes(file.tile_points, waiting),
-        work_bytes=kept_bytes + books + 2 * file.points * (row + _SPOOL_ROW_BYTES),
+        work_bytes=kept_bytes + books + file.points * (row + _SPOOL_ROW_BYTES + _CUT_ROW_BYTES),
         seconds=seconds + (_TILES + _READ) * millions,
     )
 

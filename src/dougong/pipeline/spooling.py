@@ -1,13 +1,15 @@
-"""A cloud that was filtered on tiles, decoded once more: what was kept goes to disk."""
+"""A cloud that was filtered on tiles, gone through once more: what was kept goes to disk."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from dougong.cloud import Cloud
 from dougong.pipeline.books import Books
-from dougong.pipeline.kept import Kept, KeptFile, together
+from dougong.pipeline.kept import Kept, together
 from dougong.pipeline.removed import removed_sample, shortened
 from dougong.pipeline.steps import Filtered
+from dougong.threads import ahead
+from dougong.tiles.store import CloudFile
 
 
 def spooled(
@@ -27,11 +29,11 @@ def spooled(
     OutputError
         The disk is full, or `folder` cannot be written.
     """
-    file = KeptFile(folder)
+    file = CloudFile(folder, "kept")
     removed: Cloud | None = None
-    for chunk, part in books.along(chunks):
-        file.add(kept(part))
+    for chunk, part in books.along(ahead(chunks)):
+        file.append(kept(part))
         more = removed_sample(chunk, part.codes, details=part.details)
         removed = more if removed is None else shortened(together([removed, more]))
     assert removed is not None
-    return file.finished(), removed
+    return Kept.on_disk(file), removed

@@ -31,7 +31,7 @@ from dougong.tiles.engine import engine_in_use
 from dougong.tiles.folder import Folder
 from dougong.tiles.partition import partition
 from dougong.tiles.parts import state_of
-from dougong.tiles.spool import Spool
+from dougong.tiles.spool import Spool, remove_spool
 from dougong.tiles.stages import TileBench
 
 CHUNK_POINTS = 1_000_000
@@ -118,10 +118,16 @@ def filter_chunks(
     folder: Folder,
     scratch: Path,
     progress: Progress,
-) -> Books:
-    """Filter a cloud that comes in `chunks` without ever holding it; return the books of it.
+) -> tuple[Books, Spool | None]:
+    """Filter a cloud that comes in `chunks` without ever holding it.
 
-    They lie in `scratch`.
+    Returns
+    -------
+    books : Books
+        They lie in `scratch`.
+    spool : Spool or None
+        The cloud once more, faster than it is decoded; whoever gets it removes it. None: the tiles
+        were there, and of `chunks` nothing was taken.
 
     Parameters
     ----------
@@ -136,7 +142,8 @@ def filter_chunks(
     folder : Folder
         Gets the tiles. Those that an earlier run left there are gone on with.
     scratch : Path
-        Gets the cloud while it is cut, twice over, and then the books; may be the same folder.
+        Gets the cloud and, while it is cut, its coordinates once more, then the books; may be the
+        same folder.
     progress : Progress
 
     Raises
@@ -148,11 +155,14 @@ def filter_chunks(
     """
     start = time.perf_counter()
     with engine_in_use() as engine:
-        tiles = load_tiles(folder)
+        tiles, spool = load_tiles(folder), None
         if tiles is None:
             most = room.tile_points(points, waiting)
             kept = max(most // (HALO_SHARE * engine.width), 1)
-            tiles = _cut(chunks, job, most, kept, (folder, scratch), progress)
+            spool = _spooled(chunks, folder, scratch)
+            tiles = _cut(spool, job, most, kept, folder, progress)
+        else:
+            remove_spool(scratch)
         name = tiles.facts["name"]
         stages = [_grid_stage(tiles, time.perf_counter() - start)] if job.grid is not None else []
         bench = TileBench(tiles, engine)
@@ -160,7 +170,7 @@ def filter_chunks(
     if stages and not stages[-1].points_out:
         raise InputError(nothing_kept(name, tiles.facts["points_in"], stages))
     noticed = (*tiles.facts["notes"], *tiles.facts["faults"])
-    return _books(bench, tuple(stages), tuple(notes), noticed, scratch / "books")
+    return _books(bench, tuple(stages), tuple(notes), noticed, scratch / "books"), spool
 
 
 def _run_steps(
@@ -188,24 +198,23 @@ def _run_steps(
     return notes
 
 
-def _cut(
-    chunks: Iterator[Cloud],
-    job: TiledJob,
-    most: int,
-    most_kept: int,
-    places: tuple[Folder, Path],
-    progress: Progress,
-) -> TiledCloud:
-    """Spool the cloud, thin it where the job begins with a grid, and cut it."""
-    folder, scratch = places
+def _spooled(chunks: Iterator[Cloud], folder: Folder, scratch: Path) -> Spool:
+    """Write the cloud to `scratch`."""
     # What a killed run left is of no use before its last file, the list of tiles.
     folder.remove()
     shutil.rmtree(scratch, ignore_errors=True)
-    spool = Spool(chunks, scratch)
-    require_metric(spool.first)
-    if job.grid is not None:
-        progress.stage(f"{spool.first.name}: octree voxel grid on tiles")
+    return Spool(chunks, scratch)
+
+
+def _cut(
+    spool: Spool, job: TiledJob, most: int, most_kept: int, folder: Folder, progress: Progress
+) -> TiledCloud:
+    """Thin the cloud where the job begins with a grid, and cut it."""
     first = spool.first
+    assert first is not None
+    require_metric(first)
+    if job.grid is not None:
+        progress.stage(f"{first.name}: octree voxel grid on tiles")
     told = {
         "name": first.name,
         "notes": list(first.notes),

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dougong.cloud import Records
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, Root, octree_voxel_grid, root_cube_of
 from dougong.formats.faults import (
     copies_in,
@@ -17,14 +18,12 @@ from dougong.formats.faults import (
     robust_box,
     sample_step,
 )
-from dougong.tiles.cloud import POINTS, Tile, TiledCloud, name_of, tile_of, write_arrays
+from dougong.tiles.cloud import POINTS, Arrays, Tile, TiledCloud, name_of, tile_of, write_arrays
 from dougong.tiles.folder import Folder
 from dougong.tiles.grid import grid_for
 from dougong.tiles.spool import Spool, cut
 from dougong.tiles.store import RowFile, Rows
-from dougong.typing import Points
-
-_COUNT = np.dtype([("voxel_count", "<i4")])
+from dougong.typing import Index, Points
 
 
 def partition(
@@ -40,7 +39,7 @@ def partition(
     Parameters
     ----------
     spool : Spool
-        Used up. What grows by appending stays on its disk.
+        What grows by appending stays on its disk.
     params : OctreeVoxelGrid or None
         None keeps every point.
     folder : Folder
@@ -53,25 +52,25 @@ def partition(
 
     Notes
     -----
-    Memory: about 150 bytes per point of a tile. Disk: twice the records and 32 bytes per point.
+    Memory: about 150 bytes per point of a tile. Disk: 32 bytes per point, twice 36 per kept one.
     """
-    root = root_cube_of(spool.blocks, spool.points, params or OctreeVoxelGrid())
+    root = root_cube_of(spool.coordinates, spool.points, params or OctreeVoxelGrid())
     sample, far = _sample_and_far(spool)
-    kept = spool.make("kept", _COUNT)
+    kept = RowFile(spool.folder / "kept.rows", is_thinned=True)
     copies = points = 0
     grid = grid_for(root.low, root.edge_m, root.voxel_m, spool.points, most)
     for part in spool.cut(grid, most):
         rows = part.read()
         part.remove()
         copies += copies_in(rows.xyz)
-        chosen = _chosen(rows, params, root)
+        chosen = _chosen(rows, spool, params, root)
         kept.append(chosen)
         points += len(chosen.row)
     grid = grid_for(root.low, root.edge_m, root.voxel_m, points, most_kept)
     tiles = tuple(
-        _saved(part, folder, is_decimated=params is not None)
-        for part in cut(kept, grid, most_kept, spool.make)
+        _saved(part, folder, is_decimated=params is not None) for part in cut(kept, grid, most_kept)
     )
+    assert spool.first is not None
     faults = faults_in_words(
         spool.first.frame, points=spool.points, copies=copies, far=far, sample=sample
     )
@@ -84,22 +83,24 @@ def _sample_and_far(spool: Spool) -> tuple[Points, int]:
     """Return the sample that shapes the cloud's box, and how many points lie far from it."""
     step, start = sample_step(spool.points), 0
     parts = []
-    for xyz in spool.blocks():
+    for xyz in spool.coordinates():
         parts.append(xyz[-start % step :: step].copy())
         start += len(xyz)
     sample = np.concatenate(parts)
     box = robust_box(sample)
-    return sample, sum(points_beyond(xyz, *box) for xyz in spool.blocks())
+    return sample, sum(points_beyond(xyz, *box) for xyz in spool.coordinates())
 
 
-def _chosen(rows: Rows, params: OctreeVoxelGrid | None, root: Root) -> Rows:
+def _chosen(rows: Rows, spool: Spool, params: OctreeVoxelGrid | None, root: Root) -> Rows:
     """Return the kept points of a tile, with how many each stands for."""
-    counts = np.ones(len(rows.row), dtype=_COUNT)
     if params is None:
-        return Rows(rows.row, rows.xyz, counts)
-    selection = octree_voxel_grid(rows.xyz, params, records=rows.records, root=root)
-    counts["voxel_count"] = selection.attributes["voxel_count"]
-    return Rows(rows.row, rows.xyz, counts).take(selection.is_kept)
+        return rows._replace(stands_for=np.ones(len(rows.row), np.int32))
+
+    def records_at(places: Index) -> Records:
+        return spool.records_at(rows.row[places])
+
+    selection = octree_voxel_grid(rows.xyz, params, records=records_at, root=root)
+    return rows._replace(stands_for=selection.attributes["voxel_count"]).take(selection.is_kept)
 
 
 def _saved(part: RowFile, folder: Folder, *, is_decimated: bool) -> Tile:
@@ -107,9 +108,10 @@ def _saved(part: RowFile, folder: Folder, *, is_decimated: bool) -> Tile:
     rows = part.read()
     rows = rows.take(np.argsort(rows.row))
     tile = tile_of(part.path.stem, rows.xyz)
-    arrays = {"xyz": rows.xyz, "row": rows.row}
+    arrays: Arrays = {"xyz": rows.xyz, "row": rows.row}
     if is_decimated:
-        arrays["voxel_count"] = rows.records["voxel_count"].copy()
+        assert rows.stands_for is not None
+        arrays["voxel_count"] = rows.stands_for
     write_arrays(folder, name_of(tile, POINTS), arrays, {})
     part.remove()
     return tile

@@ -6,63 +6,77 @@ from pathlib import Path
 import numpy as np
 
 from dougong.cloud import Cloud
-from dougong.tiles.grid import TileGrid, leaves_of
-from dougong.tiles.store import RowFile, RowFileMaker, Rows, make_row_file
-from dougong.typing import Points
+from dougong.threads import ahead
+from dougong.tiles.grid import Leaves, TileGrid, leaves_of
+from dougong.tiles.store import CloudFile, RowFile, Rows
 
 
-class Spool:
+class Spool(CloudFile):
     """A cloud on disk in the order it was decoded."""
 
     def __init__(self, clouds: Iterable[Cloud], folder: Path) -> None:
-        """Write `clouds`, which share one frame and one layout, to `folder`."""
-        self.make = make_row_file(folder)
-        self.points = 0
-        self._file: RowFile | None = None
-        for cloud in clouds:
-            if self._file is None:
-                self.first = cloud.select(np.arange(0))
-                self._file = self.make("spool", cloud.records.dtype)
-            rows = np.arange(self.points, self.points + len(cloud))
-            self._file.append(Rows(rows, cloud.xyz, cloud.records))
-            self.points += len(cloud)
-
-    def pieces(self) -> Iterator[Rows]:
-        """Yield the cloud from its beginning."""
-        assert self._file is not None
-        return self._file.pieces()
-
-    def blocks(self) -> Iterator[Points]:
-        """Yield the coordinates from the beginning."""
-        assert self._file is not None
-        return self._file.coordinates()
+        """Write `clouds`, at least one, which share one frame and one layout, to `folder`."""
+        super().__init__(folder, _NAME)
+        self.folder = folder
+        for cloud in ahead(clouds):
+            self.append(cloud)
 
     def cut(self, grid: TileGrid, most: int) -> Iterator[RowFile]:
-        """Cut the cloud into tiles, see `cut`. The spool is used up."""
-        assert self._file is not None
-        yield from cut(self._file, grid, most, self.make)
+        """Cut the cloud into tiles of at most `most` points, see `cut`. It stays as it is."""
+        leaves = leaves_of(self.coordinates(), grid, most)
+        tiles = _dealt(self._rows(), leaves, self.folder, is_thinned=False)
+        return _halved(tiles, leaves, grid, most)
+
+    def _rows(self) -> Iterator[Rows]:
+        done = 0
+        for xyz in self.coordinates():
+            yield Rows(np.arange(done, done + len(xyz)), xyz)
+            done += len(xyz)
 
 
-def cut(file: RowFile, grid: TileGrid, most: int, make: RowFileMaker) -> Iterator[RowFile]:
+_NAME = "spool"
+
+
+def remove_spool(folder: Path) -> None:
+    """Delete what a run that was killed left of a spool in `folder`."""
+    for file in folder.glob(f"{_NAME}.*"):
+        file.unlink()
+
+
+def cut(file: RowFile, grid: TileGrid, most: int) -> Iterator[RowFile]:
     """Cut the rows of `file` into tiles of at most `most` points and yield them one by one.
 
     The file is used up. Tiles are yielded in the order of their coordinates; whoever takes one
     removes it. A tile of one voxel is never halved, however many points lie in it.
     """
     leaves = leaves_of(file.coordinates(), grid, most)
+    tiles = _dealt(file.pieces(), leaves, file.path.parent, is_thinned=file.is_thinned)
+    file.remove()
+    yield from _halved(tiles, leaves, grid, most)
+
+
+def _dealt(
+    pieces: Iterator[Rows], leaves: Leaves, folder: Path, *, is_thinned: bool
+) -> dict[int, RowFile]:
+    """Write rows into a file in `folder` for each tile, by its place in `leaves.names`."""
     tiles: dict[int, RowFile] = {}
-    for rows in file.pieces():
-        parts = leaves.part(rows.xyz)
+    for rows, parts in ahead((rows, leaves.part(rows.xyz)) for rows in pieces):
         for index, leaf in enumerate(parts.tiles.tolist()):
             chosen = parts.order[parts.starts[index] : parts.starts[index + 1]]
             if leaf not in tiles:
                 name = "_".join(map(str, leaves.names[leaf]))
-                tiles[leaf] = make(name, file.layout)
+                tiles[leaf] = RowFile(folder / f"{name}.rows", is_thinned=is_thinned)
             tiles[leaf].append(rows.take(chosen))
-    file.remove()
+    return tiles
+
+
+def _halved(
+    tiles: dict[int, RowFile], leaves: Leaves, grid: TileGrid, most: int
+) -> Iterator[RowFile]:
+    """Yield tiles in order, those of too many points cut again."""
     for leaf in sorted(tiles):
         level = leaves.names[leaf][0]
         if leaves.counts[leaf] > most and level > 0:
-            yield from cut(tiles[leaf], grid._replace(level=level - 1), most, make)
+            yield from cut(tiles[leaf], grid._replace(level=level - 1), most)
         else:
             yield tiles[leaf]
