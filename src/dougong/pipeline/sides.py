@@ -74,8 +74,8 @@ def cut(sets: tuple[Iterable[Points], Iterable[Points]], folder: Path, most: int
     OutputError
         The disk is full, or the folder cannot be written.
     """
+    # In the cut the points of the second set come behind those of the first.
     first = 0
-    """Points of the first set: in the cut those of the second come behind them."""
 
     def clouds() -> Iterator[Cloud]:
         nonlocal first

@@ -10,6 +10,8 @@ from dougong.threads import ahead
 from dougong.tiles.grid import Leaves, TileGrid, leaves_of
 from dougong.tiles.store import CloudFile, RowFile, Rows
 
+_NAME = "spool"
+
 
 class Spool(CloudFile):
     """A cloud on disk in the order it was decoded."""
@@ -32,9 +34,6 @@ class Spool(CloudFile):
         for xyz in self.coordinates():
             yield Rows(np.arange(done, done + len(xyz)), xyz)
             done += len(xyz)
-
-
-_NAME = "spool"
 
 
 def remove_spool(folder: Path) -> None:
