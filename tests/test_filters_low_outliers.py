@@ -180,3 +180,38 @@ def test_voxel_kernels_equal_their_definitions(seed):
             [expected[linked[v] | (np.arange(number) == v)].min() for v in range(number)]
         )
     np.testing.assert_array_equal(parent, expected)
+
+
+def upright(rng, density, origin, along, height, noise=0.004):
+    """Points of a wall over `along` (2,) from `origin` (3,), this high."""
+    number = int(density * np.hypot(*along) * height)
+    u, v = rng.random((2, number))
+    xyz = np.array(origin) + np.column_stack([u[:, None] * along, v * height])
+    return xyz + rng.normal(0, noise, xyz.shape)
+
+
+WALLS = {
+    "moat wall 10 x 4.5 m": ((15, 20, -4.5), (10, 0), 4.5),
+    "moat wall, turned": ((15, 15, -4.5), (8.5, 5), 4.5),
+    "back of a vault 3 x 2 m": ((20, 20, -2.5), (0, 3), 2.0),
+}
+
+
+@pytest.mark.parametrize("name", WALLS)
+def test_walls_below_the_ground_stay(name):
+    """A wall has next to no area in plan: its 88,571 points went as stray ones."""
+    rng = np.random.default_rng(6)
+    wall = upright(rng, 300, *WALLS[name])
+    noise = strays(rng, 400, -8, -1)
+    low = is_low(np.concatenate([wall, patch(rng, 300, (0, 40, 0, 40), 0.0), noise]))
+    assert not low[: len(wall)].any()
+    assert low[-len(noise) :].mean() > 0.95
+
+
+def test_a_clump_below_the_ground_goes():
+    rng = np.random.default_rng(7)
+    clump = rng.normal([20.0, 20.0, -2.0], 0.15, (300, 3))
+    points = np.concatenate([clump, patch(rng, 300, (0, 40, 0, 40), 0.0)])
+    low = is_low(points)
+    assert low[: len(clump)].all()
+    assert not low[len(clump) :].any()

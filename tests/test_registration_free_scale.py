@@ -7,6 +7,7 @@ from dougong.registration import Icp, Register, register
 from dougong.registration.free_scale import scaled, search_scale
 from dougong.registration.icp_solve import moved_by
 from dougong.registration.prepare import Prepare, prepare
+from dougong.registration.scale_check import size_doubt
 from dougong.registration.similarity_fit import fit_similarity, grown
 from registration_sites import as_cloud, motion, moved, rectangle, site
 
@@ -54,6 +55,21 @@ def test_the_fit_finds_pose_and_scale(side):
     assert fit.covariance is not None
     error = abs(np.log(1.01 * fit.factor))
     assert error < max(3e-4, 2.0 * np.sqrt(fit.covariance[6, 6]))
+
+
+@pytest.mark.parametrize(("factor", "is_one_size"), [(1.0003, True), (0.99, False)])
+def test_clouds_of_different_size_are_told_apart(factor, is_one_size):
+    """A drone cloud 1 % too small was laid on the scan as `ok`, decimetres off at its ends."""
+    scan, drone, truth = survey(1.0)
+    one, two = prepare(scan, "lidar", THIN), prepare(drone, "photogrammetry", THIN)
+    T = truth.copy()
+    T[:3, 3] += T[:3, :3] @ scan.frame.origin - drone.frame.origin
+    T[:3, 3] *= factor
+    doubt = size_doubt(one, scaled(two, factor), T, Icp(), 0.05)
+    assert (doubt is None) == is_one_size
+    if doubt is not None:
+        assert "the target is 1 % smaller" in doubt[0]
+        assert 0.2 < doubt[1] < 1.0
 
 
 @pytest.mark.parametrize("metres_per_unit", [0.013, 87.0])

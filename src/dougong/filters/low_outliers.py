@@ -37,8 +37,9 @@ class LowOutliers(Parameters):
     min_depth_m: Annotated[float, Field(gt=0)] = 0.3
     """Points less than this below the ground are left to the cloth's own threshold, metres."""
     smallest_level_m2: Annotated[float, Field(gt=0)] = 4.0
-    """A connected surface of at least this plan area is real, however deep it lies. Pits that are
-    smaller and joined to nothing (a manhole seen from above) are taken for multipath."""
+    """A connected surface that shows at least this area in plan, or from the side as walls do, is
+    real, however deep it lies. Pits that are smaller and joined to nothing (a manhole seen from
+    above) are taken for multipath."""
     min_points: Annotated[int, Field(ge=1)] = 3
     """A surface has at least this many points in the 3 x 3 x 3 voxels round each of its points."""
     min_share: Annotated[float, Field(ge=0, lt=1)] = 0.02
@@ -261,7 +262,30 @@ def _levels(columns: _Columns, params: LowOutliers) -> NDArray[np.bool_]:
     smallest = int(np.ceil(params.smallest_level_m2 / columns.cell**2))
     is_level = np.empty(number, np.bool_)
     kernels.mark_levels(columns.unique, columns.shape[2], is_strong, parent, smallest, is_level)
-    return is_level
+    return is_level | _are_upright(columns, is_strong & ~is_level, parent, params)
+
+
+def _are_upright(
+    columns: _Columns, asked: NDArray[np.bool_], parent: Index, params: LowOutliers
+) -> NDArray[np.bool_]:
+    """Return which of the `asked` voxels belong to a surface that is large seen from a side.
+
+    The wall of a moat, the back of a vault below a terrace: they have next to no area in plan.
+    """
+    least = int(np.ceil(params.smallest_level_m2 / (columns.cell * columns.level)))
+    voxels = np.flatnonzero(asked)
+    surfaces, of, held = np.unique(parent[voxels], return_inverse=True, return_counts=True)
+    # Of fewer voxels no side is large enough: hardly any surface is left.
+    is_many = held[of] >= least
+    voxels, of = voxels[is_many], of[is_many]
+    plan, height = np.divmod(columns.unique[voxels], columns.shape[2])
+    is_large = np.zeros(len(surfaces), np.bool_)
+    for along in np.divmod(plan, columns.shape[1]):
+        seen = np.unique(np.column_stack([of, along, height]), axis=0)
+        is_large |= np.bincount(seen[:, 0], minlength=len(surfaces)) >= least
+    found = np.zeros(len(asked), np.bool_)
+    found[voxels[is_large[of]]] = True
+    return found
 
 
 def _ground(columns: _Columns, is_level: NDArray[np.bool_], params: LowOutliers) -> Values:

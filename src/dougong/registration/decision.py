@@ -21,6 +21,7 @@ from dougong.registration.probability import BELIEF, Evidence
 from dougong.registration.result import FineResult, Hypothesis
 from dougong.registration.rivals import is_same, middle_of
 from dougong.registration.roof_sides import height_left_open, weigh_height
+from dougong.registration.scale_check import size_doubt
 from dougong.registration.settings import Register
 from dougong.registration.verdict import Ruling, rule, status_of
 from dougong.typing import Transform
@@ -85,6 +86,11 @@ def decide(
         pulled = _weigh_points(source, target, ruling, fine, params)
         if pulled is not None:
             (status, reason), evidence = pulled, replace(evidence, spread_m=np.inf)
+    if status == "ok" and fine is not None:
+        doubt = size_doubt(source, target, T, _icp(params), params.verdict.most_spread_m)
+        if doubt is not None:
+            (reason, moved), status = doubt, "ambiguous"
+            evidence = replace(evidence, spread_m=moved)
     if status == "ok" and fine is not None and adjusted is None:
         left_open = height_left_open(court, source, target, T)
         status, reason = weigh_height(reason, left_open)
