@@ -57,6 +57,28 @@ def drone(cloud):
     return filter_cloud(cloud, "photogrammetry")
 
 
+def test_gravestones_stand_on_the_ground():
+    """Judged without the ground that they stand on they hovered: nine of ten points went."""
+    rng = np.random.default_rng(3)
+    ground = np.column_stack([rng.uniform(-15, 15, (180_000, 2)), np.zeros(180_000)])
+    sides = []
+    for x, y in np.stack(np.meshgrid(np.arange(-12, 13, 4), np.arange(-12, 13, 4)), -1).reshape(
+        -1, 2
+    ):
+        along, up = rng.random((2, 160))
+        face = np.where(rng.random(160) < 0.5, 0.0, 0.1)
+        sides.append(np.column_stack([x + 0.5 * along, y + face, 0.8 * up]))
+    stones = np.vstack(sides)
+    strays = rng.uniform([-15, -15, 0.15], [15, 15, 1.0], (300, 3))
+    points = np.vstack([ground, stones, strays])
+    points[:-300, :] += rng.normal(0, 0.002, (len(points) - 300, 3))
+    codes = filter_cloud(Cloud.from_points(points), "lidar").codes
+    is_kept, is_thinned = codes == Reason.KEPT, codes == Reason.DECIMATED
+    mine = slice(len(ground), len(points) - 300)
+    assert is_kept[mine][~is_thinned[mine]].mean() > 0.95
+    assert is_kept[-300:].mean() < 0.05
+
+
 def test_stages_run_in_the_order_of_the_method(lidar, drone):
     assert [stage.name for stage in lidar.stages] == [
         "octree_voxel_grid", "low_outliers", "cloth_simulation", "curvature_weighted",

@@ -203,6 +203,7 @@ def curvature_weighted(
     *,
     voxel_count: ArrayLike | None = None,
     whole: Totals | None = None,
+    beside: ArrayLike | None = None,
 ) -> Selection:
     """Choose the points that have a neighbour about as near as their surroundings do.
 
@@ -215,6 +216,9 @@ def curvature_weighted(
         How many points each point stands for after decimation; used by `solid_voxel_count`.
     whole : Totals, optional
         Where the points are a part of a cloud: what ``global`` knows of it.
+    beside : array_like, shape (m, 3), optional
+        Points that are there too and are not judged, such as the ground: to the rule
+        ``protective`` a gravestone without it hovers. The other rules do not look at them.
 
     Returns
     -------
@@ -235,7 +239,7 @@ def curvature_weighted(
     """
     p = params or CurvatureWeighted()
     if p.rule == "protective":
-        return _protective(points, p, voxel_count)
+        return _protective(points, p, voxel_count, beside)
     found = _judge(points, p, whole)
     lattice = found.lattice
     n = len(lattice.points)
@@ -254,14 +258,19 @@ def curvature_weighted(
 
 
 def _protective(
-    points: ArrayLike, p: CurvatureWeighted, voxel_count: ArrayLike | None
+    points: ArrayLike,
+    p: CurvatureWeighted,
+    voxel_count: ArrayLike | None,
+    beside: ArrayLike | None,
 ) -> Selection:
-    verdict = protective.judge(points, p.tests, p.reach_m)
+    own = as_points(points)
+    seen = own if beside is None else np.concatenate([own, as_points(beside)])
+    verdict = protective.judge(seen, p.tests, p.reach_m).of_first(len(own))
     chosen = protective_choice(verdict.margin, verdict.reason, p, voxel_count)
     note = None
     if len(chosen.is_kept):
         spacing_m = float(np.median(verdict.spacing_m))
-        note = concentration_note(as_points(points), chosen.is_kept, verdict.curvature, spacing_m)
+        note = concentration_note(own, chosen.is_kept, verdict.curvature, spacing_m)
     more = {"curvature": verdict.curvature, "spacing_m": verdict.spacing_m}
     return Selection(
         is_kept=chosen.is_kept,

@@ -55,6 +55,10 @@ class Verdict(NamedTuple):
     curvature: Values
     """(n,) surface variation of the 12 nearest."""
 
+    def of_first(self, count: int) -> Verdict:
+        """Return what is said about the first `count` points."""
+        return Verdict._make(values[:count] for values in self)
+
 
 class Doubtful(NamedTuple):
     """Points of a cloud or a part that may go: some test or a group speaks against them."""

@@ -223,11 +223,15 @@ def run_curvature_weighted(
 ) -> None:
     """Take out isolated points while edges and brackets stay (CWASF)."""
     counts = bench.voxel_count
+    beside = None if among is None else bench.cloud.xyz[np.setdiff1d(bench.left(), among, True)]
     bench.apply(
         "curvature_weighted",
         Reason.CURVATURE_WEIGHTED,
         lambda index: curvature_weighted(
-            bench.cloud.xyz[index], params, voxel_count=None if counts is None else counts[index]
+            bench.cloud.xyz[index],
+            params,
+            voxel_count=None if counts is None else counts[index],
+            beside=beside,
         ),
         among,
     )

@@ -84,6 +84,7 @@ def _few_of(job: Job, tile: Tile, tested: str, judged: str = "") -> Doubtful:
 def judge(job: Job) -> tuple[Arrays, Record]:
     """Write down what was found; known: the steps of the tests and of `hovering`, and the reach.
 
+    The tests are of every point that is left, also where only those off the ground are judged.
     The second is None where there are too few points to judge any.
     """
     assert isinstance(job.params, CurvatureWeighted)
@@ -98,13 +99,14 @@ def judge(job: Job) -> tuple[Arrays, Record]:
         place = found["few_place"]
         margin[place], reason[place] = rows_excused(few, own, reach), few.reason[:own]
         reason[margin <= 1.0] = Taken.KEPT
+    asked = asked_of(job.folder, job.tile, job.before, job.among)
+    is_judged = asked[asked_of(job.folder, job.tile, job.before, "left")]
     counts = None
     if job.params.solid_voxel_count is not None:
         stored = read_arrays(job.folder, job.tile, POINTS, "voxel_count", if_there=True)
         if stored:
-            asked = asked_of(job.folder, job.tile, job.before, job.among)
             counts = stored["voxel_count"][asked]
-    chosen = protective_choice(margin, reason, job.params, counts)
+    chosen = protective_choice(margin[is_judged], reason[is_judged], job.params, counts)
     return booked(job, chosen, Reason.CURVATURE_WEIGHTED)
 
 

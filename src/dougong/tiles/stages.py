@@ -8,7 +8,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -43,7 +43,7 @@ from dougong.tiles.cloud import (
 )
 from dougong.tiles.engine import Engine, Task
 from dougong.tiles.parts import Among, Job, asked_of, asked_points, is_asked, state_of
-from dougong.typing import Mask
+from dougong.typing import Mask, Values
 
 Work = Callable[[Job], tuple[Arrays, Record]]
 
@@ -136,9 +136,20 @@ class _Stage:
         ]
         return self.engine.run(tasks), key
 
+    def of_all_left(self) -> "_Stage":
+        """Return the stage asked about every point that is left."""
+        if self.among == "left":
+            return self
+        masks = (asked_of(self.cloud.folder, t, self.before, "left") for t in self.cloud.tiles)
+        return replace(self, among="left", asked=sum(int(mask.sum()) for mask in masks))
+
     def mask(self, tile: Tile) -> Mask:
         """Return which points of a tile are asked about."""
         return asked_of(self.cloud.folder, tile, self.before, self.among)
+
+    def mask_in_left(self, tile: Tile) -> Mask:
+        """Return which of a tile's points that are left are asked about."""
+        return self.mask(tile)[asked_of(self.cloud.folder, tile, self.before, "left")]
 
     def blocks(self) -> Any:
         """Yield the points that the stage is asked about, tile by tile."""
@@ -262,14 +273,16 @@ def _curvature_weighted(stage: _Stage) -> Outcome:
 
 
 def _protective(stage: _Stage, params: CurvatureWeighted) -> Outcome:
-    asked = stage.asked
-    reach, eighth = _reach(stage, params)
-    _, tested = stage.map("surroundings", protective.test_points, (eighth, reach))
+    # What is not judged, the ground, is seen: without it a gravestone hovers.
+    seen = stage.of_all_left()
+    reach, eighth = _reach(seen, params)
+    _, tested = seen.map("surroundings", protective.test_points, (eighth, reach))
     judged = None
-    if not is_too_few(asked, params.reach_m):
-        judged = _hovering(stage, tested, reach, is_whole=params.reach_m is None)
-    records, key = stage.map("curvature_weighted", protective.judge, (tested, judged, reach))
-    note = _concentration(stage, tested, key) if asked else None
+    if not is_too_few(seen.asked, params.reach_m):
+        judged = _hovering(seen, tested, reach, is_whole=params.reach_m is None)
+    known = (tested, judged, reach)
+    records, key = stage.map("curvature_weighted", protective.judge, known)
+    note = _concentration(stage, tested, key) if stage.asked else None
     return records, () if note is None else (note,), key
 
 
@@ -313,16 +326,22 @@ def _reach(stage: _Stage, params: CurvatureWeighted) -> tuple[float, str]:
 
 def _concentration(stage: _Stage, tested: str, key: str) -> str | None:
     """Return what is to be said where removal concentrates on fine geometry."""
-    spacing_m = median(stage.values(tested, "spacing"))
+    folder, tiles = stage.cloud.folder, stage.cloud.tiles
+
+    def of_judged(tile: Tile, name: str) -> Values:
+        # The tests are of every point that is left.
+        return read_arrays(folder, tile, tested, name)[name][stage.mask_in_left(tile)]
+
+    spacing_m = median(lambda: (of_judged(tile, "spacing") for tile in tiles))
     if not spacing_m > 0:
         return None
     parts = []
-    for tile, points in zip(stage.cloud.tiles, stage.blocks(), strict=True):
+    for tile, points in zip(tiles, stage.blocks(), strict=True):
         if not len(points):
             continue
-        code = read_arrays(stage.cloud.folder, tile, key, "code")["code"]
+        code = read_arrays(folder, tile, key, "code")["code"]
         is_kept = code[stage.mask(tile)] == Reason.KEPT
-        curvature = read_arrays(stage.cloud.folder, tile, tested, "curvature")["curvature"]
+        curvature = of_judged(tile, "curvature")
         parts.append(tally(points, is_kept, curvature, spacing_m))
     return note_of(together(parts)) if parts else None
 
