@@ -13,6 +13,7 @@ from dougong.errors import InputError
 from dougong.filters.cloth_simulation import ClothSimulation, cloth_simulation
 from dougong.filters.clutter import Clutter, clutter
 from dougong.filters.curvature_weighted import CurvatureWeighted, curvature_weighted
+from dougong.filters.lost_places import lost_places
 from dougong.filters.low_outliers import LowOutliers, low_outliers
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid
 from dougong.filters.pass_through import PassThrough, pass_through
@@ -130,8 +131,16 @@ class Bench:
             )
         )
         said = [*selection.notes, *doubts(reason, taken, len(asked))]
+        if reason in NOISE:
+            said += self._lost_places(asked, selection.is_kept)
         self.notes += [f"{self.cloud.name}, {name}: {note}" for note in said]
         return selection
+
+    def _lost_places(self, asked: Index, is_kept: Mask) -> list[str]:
+        xyz = self.cloud.xyz
+        origin = self.cloud.frame.origin
+        note = lost_places(lambda: (xyz[asked[~is_kept]],), lambda: (xyz[asked],), origin)
+        return [] if note is None else [note]
 
     def _book_details(self, selection: Selection, asked: Index) -> None:
         for name, values in details_of(selection).items():

@@ -7,7 +7,7 @@ goes on where it was and a changed parameter reruns only what depends on it.
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -15,16 +15,18 @@ from typing import Any
 import numpy as np
 
 import dougong
+from dougong.filters import FILTERS
 from dougong.filters.cloth_simulation import ClothSimulation, cloth_notes, guarded_cloth
 from dougong.filters.clutter import Clutter, clutter_notes
 from dougong.filters.concentration import note_of, tally, together
 from dougong.filters.curvature_weighted import CurvatureWeighted
+from dougong.filters.lost_places import lost_places
 from dougong.filters.low_outliers import LowOutliers, find_levels, low_notes
 from dougong.filters.pass_through import PassThrough, robust_top_of, unknown_notes
 from dougong.filters.protective import is_too_few
 from dougong.filters.radius import Radius
 from dougong.filters.ranks import ValueBlocks, count_finite, median
-from dougong.filters.selection import Reason
+from dougong.filters.selection import NOISE, Reason
 from dougong.filters.statistical import Statistical, cut_distance, stray_notes
 from dougong.filters.surroundings import REACH_M, TESTS, reach_of
 from dougong.filters.totals import Totals
@@ -43,7 +45,7 @@ from dougong.tiles.cloud import (
 )
 from dougong.tiles.engine import Engine, Task
 from dougong.tiles.parts import Among, Job, asked_of, asked_points, is_asked, state_of
-from dougong.typing import Mask, Values
+from dougong.typing import Mask, Points, Values
 
 Work = Callable[[Job], tuple[Arrays, Record]]
 
@@ -89,6 +91,8 @@ class TileBench:
         stage = _Stage(self.cloud, self.engine, self.state, params, among, asked)
         records, notes, self.state = _RUN[name](stage)
         totals = {key: sum(r[key] for r in records) for key in ("left", "asked", "taken")}
+        if FILTERS[name].reason in NOISE:
+            notes = (*notes, *stage.lost_places(self.state, self.cloud.facts.get("origin")))
         done = StageDone(
             name=name,
             notes=notes,
@@ -156,6 +160,18 @@ class _Stage:
         for tile in self.cloud.tiles:
             job = Job(self.cloud.folder, tile, self.before, self.params, self.among)
             yield asked_points(job, tile)
+
+    def lost_places(self, after: str, origin: Sequence[float] | None) -> tuple[str, ...]:
+        """Return what is to be said where this stage, which left the state `after`, took places."""
+
+        def taken() -> Iterator[Points]:
+            for tile, points in zip(self.cloud.tiles, self.blocks(), strict=True):
+                code = read_arrays(self.cloud.folder, tile, after, "code")["code"]
+                yield points[code[self.mask(tile)] != Reason.KEPT]
+
+        place = np.zeros(3) if origin is None else np.asarray(origin)
+        note = lost_places(taken, self.blocks, place)
+        return () if note is None else (note,)
 
     def values(self, stage: str, name: str) -> ValueBlocks:
         """Return the blocks of an array of an earlier step."""
