@@ -150,6 +150,59 @@ def test_a_step_that_cannot_be_kept_is_one_sentence(tmp_path, monkeypatch):
     assert list((tmp_path / "out.work").iterdir()) == []
 
 
+def test_work_is_done_in_no_folder_of_the_user(tmp_path):
+    """A folder `run` in --work, and one called RESULT.work, were emptied: inputs were lost."""
+    from dougong.pipeline.store import Store
+    from dougong.tiles.folder import LocalFolder
+
+    out = tmp_path / "result"
+    mine = [tmp_path / "run" / "scan.laz", tmp_path / "result.work" / "notes.txt"]
+    for file in mine:
+        file.parent.mkdir()
+        file.write_text("mine")
+    kept = Store.kept(LocalFolder(tmp_path), out)
+    with kept.claimed(), outputs.scratch_folder(kept.of_run) as scratch:
+        (scratch / "half").write_text("x")
+    kept.finish()
+    beside = Store.beside(out)
+    with pytest.raises(OutputError, match=r"result\.work .*dougong did not put there"):
+        beside.claimed().__enter__()
+    with (
+        pytest.raises(OutputError, match="did not put there"),
+        outputs.scratch_folder(tmp_path / "run"),
+    ):
+        pass
+    assert sorted(tmp_path.rglob("*")) == sorted([*mine, *(file.parent for file in mine)])
+
+
+def test_a_killed_run_leaves_a_folder_that_the_next_one_uses(tmp_path):
+    from dougong.pipeline.store import Store
+
+    store = Store.beside(tmp_path / "result")
+    killed = [store.claimed(), outputs.scratch_folder(store.of_run)]
+    for folder in killed:
+        folder.__enter__()
+    (store.of_run / "half").write_text("x")
+    with store.claimed(), outputs.scratch_folder(store.of_run) as scratch:
+        assert not (scratch / "half").exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_full_clouds_and_distances_of_an_earlier_result_go(tmp_path):
+    out = tmp_path / "result"
+    for name in ("full/st0.laz", "full/st0.laz.json", "full/keep.txt", "distances/scan.laz"):
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text("old")
+    result = {
+        "clouds": [{"name": "scan"}],
+        "full_resolution": {"files": [{"file": "full/st0.laz"}]},
+    }
+    outputs.write_json(out / "result.json", result)
+    with outputs.result_folder(out) as part:
+        (part / "result.json").write_text("{}")
+    assert sorted(f.name for f in out.rglob("*") if f.is_file()) == ["keep.txt", "result.json"]
+
+
 def test_an_error_names_the_folder_that_the_user_named(tmp_path):
     def job():
         with outputs.result_folder(tmp_path / "result") as part:

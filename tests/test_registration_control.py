@@ -1,6 +1,7 @@
 """Control points: adjusted by their sigmas, decide what clouds cannot, never hide a wrong pose."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -310,6 +311,25 @@ def test_a_wrong_control_file_is_one_sentence(tmp_path, changed, words):
     assert "\n" not in str(error.value)
 
 
+def test_rows_without_a_cloud_are_not_lost_beside_rows_that_name_it():
+    named = replace(points_of(4), names=("a", "b", "c", "d"))
+    shared = replace(points_of(3), names=("e", "f", "g"), is_check=np.ones(3, bool))
+    both = control_of({"scan": named, "": shared}, "scan-1", "scan")
+    assert both is not None
+    assert both.names == ("a", "b", "c", "d", "e", "f", "g")
+    assert both.is_check.tolist() == [False] * 4 + [True] * 3
+    assert both.source.shape == both.target.shape == (7, 3)
+    twice = replace(shared, names=("e", "b", "g"))
+    with pytest.raises(InputError, match="point b has a row for scan and one without"):
+        control_of({"scan": named, "": twice}, "scan")
+
+
+def points_of(count):
+    at = np.arange(3.0 * count).reshape(count, 3)
+    no = np.zeros(count, bool)
+    return ControlPoints(names=(), source=at, target=at, sigma_m=at[:, 0] + 1.0, is_check=no)
+
+
 def test_a_missing_column_is_named(tmp_path):
     path = tmp_path / "c.csv"
     path.write_text("name,cloud\nA,scan\n")
@@ -379,6 +399,15 @@ def test_a_project_says_whether_it_reaches_its_level(survey, tmp_path, level, co
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["status"] == "ok"
     assert result["quality"]["is_reached"] == (code == 0)
+
+
+def test_control_points_of_a_misspelled_cloud_are_refused(survey, tmp_path, capsys):
+    text = (survey / "control.csv").read_text()
+    (survey / "typo.csv").write_text(text.replace("scan", "scanX"))
+    project = survey / "typo.toml"
+    project.write_text(PROJECT + 'control = "typo.csv"\n')
+    assert call(["run", str(project), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert "there is no cloud 'scanX'" in capsys.readouterr().err
 
 
 def test_a_level_without_check_points_is_refused(tmp_path, capsys):

@@ -119,6 +119,15 @@ def test_a_yaw_hint_decides_a_symmetric_house():
     assert found.status == "ok"
 
 
+def test_a_hint_that_nothing_fits_near_is_not_passed_over():
+    """The only pose heard was 100 degrees from the hint, and came out as if there were none."""
+    found = decide(
+        site(4, *UNLIKE), site(5, *UNLIKE), starts(turned(0.5)), Register(yaw_hint_deg=100.0)
+    )
+    assert found.status == "ambiguous"
+    assert "fit at a yaw of 0 deg, and the hint says 100" in found.reason
+
+
 def test_two_different_places_are_never_ok():
     other = ((-10.0, -12.0, 5.0, 14.0, 7.0), (4.0, -3.0, 9.0, 3.0, 4.0))
     poses = [turned(angle, (0.3, 0.2, 0.0)) for angle in (0, 45, 90, 180, 270)]

@@ -1,7 +1,9 @@
 """Control files: places surveyed in both frames, as CSV, and what a project asks of them."""
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -85,8 +87,34 @@ def _points(
 
 
 def control_of(control: Mapping[str, ControlPoints], *names: str) -> ControlPoints | None:
-    """Return the points of a cloud by any of its `names`; rows without a cloud are everybody's."""
-    return next((control[name] for name in (*names, "") if name in control), None)
+    """Return the points of a cloud by its `names`, the first that is there, and everybody's.
+
+    Rows without a cloud are everybody's.
+
+    Raises
+    ------
+    InputError
+        A point is among both.
+    """
+    own = next((control[name] for name in names if name in control), None)
+    shared = control.get("")
+    if own is None or shared is None:
+        return own or shared
+    twice = sorted({*own.names} & {*shared.names})
+    if twice:
+        msg = (
+            f"{own.where}: point {twice[0]} has a row for {names[0]} and one without a cloud. Keep "
+            "one of them."
+        )
+        raise InputError(msg)
+    return replace(
+        own,
+        names=(*own.names, *shared.names),
+        source=np.concatenate([own.source, shared.source]),
+        target=np.concatenate([own.target, shared.target]),
+        sigma_m=np.concatenate([own.sigma_m, shared.sigma_m]),
+        is_check=np.concatenate([own.is_check, shared.is_check]),
+    )
 
 
 def control_of_project(project: Project, folder: Path) -> dict[str, ControlPoints]:
@@ -103,7 +131,9 @@ def control_of_project(project: Project, folder: Path) -> dict[str, ControlPoint
     _refuse_level_without_checks(quality.required_level, control)
     for name in control:
         # Stations of a cloud are told apart by a number behind its name.
-        if name and not any(name.startswith(entry.name) for entry in project.cloud):
+        if name and not any(
+            re.fullmatch(rf"{re.escape(entry.name)}(-\d+)?", name) for entry in project.cloud
+        ):
             msg = (
                 f"{quality.control}: there is no cloud {name!r}. Clouds of this project: "
                 f"{', '.join(entry.name for entry in project.cloud)}."

@@ -69,6 +69,38 @@ def refuse_output(input: Path, output: Path, files: Sequence[Path], overwrite: b
         raise OutputError(msg)
 
 
+_OURS = ".dougong-scratch"
+"""The file that marks a folder as one that we made, and may delete."""
+
+
+def claim_folder(folder: Path) -> None:
+    """Make `folder` and mark it as ours; one that we made before stays as it is.
+
+    Raises
+    ------
+    OutputError
+        It cannot be made, or somebody else's files are in it.
+    """
+    try:
+        if folder.is_dir() and any(folder.iterdir()) and not (folder / _OURS).exists():
+            msg = (
+                f"{folder} is needed for work in progress, but has files in it that dougong did "
+                "not put there. Move it away, or pass another --out or --work."
+            )
+            raise OutputError(msg)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / _OURS).touch()
+    except OSError as error:
+        msg = f"{folder} cannot be made: {error.strerror or error}. Pass another --work."
+        raise OutputError(msg) from error
+
+
+def leave_folder(folder: Path) -> None:
+    """Delete a claimed folder if nothing to go on from was left in it."""
+    if [path.name for path in folder.glob("*")] in ([], [_OURS]):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 @contextmanager
 def scratch_folder(folder: Path) -> Iterator[Path]:
     """Make `folder`, empty, and delete it in the end; what a killed run left there goes too.
@@ -76,15 +108,12 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
     Raises
     ------
     OutputError
-        It cannot be made.
+        It cannot be made, or somebody else's files are in it.
     """
-    shutil.rmtree(folder, ignore_errors=True)
     had_parent = folder.parent.exists()
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        msg = f"{folder} cannot be made: {error.strerror or error}. Pass another --work."
-        raise OutputError(msg) from error
+    claim_folder(folder)
+    shutil.rmtree(folder, ignore_errors=True)
+    claim_folder(folder)
     try:
         yield folder
     finally:
@@ -232,16 +261,19 @@ def _move_into(part: Path, out: Path) -> None:
         raise OutputError(msg) from error
 
 
-_OF_CLOUDS = ("clouds", "registrations", "removed")
+_OF_CLOUDS = ("clouds", "registrations", "removed", "distances")
 """Folders of a result that hold files named after its clouds."""
 
 
 def _clouds_of_earlier_result(out: Path) -> set[Path]:
     """Return the files in `out` that the result.json there calls its clouds' own."""
     try:
-        clouds = json.loads((out / "result.json").read_text(encoding="utf-8"))["clouds"]
-        starts = tuple(f"{cloud['name']}." for cloud in clouds)
-    except (OSError, ValueError, KeyError, TypeError):
+        result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+        starts = tuple(f"{cloud['name']}." for cloud in result["clouds"])
+        again = (result.get("full_resolution") or {}).get("files", [])
+        full = {out / f"{file['file']}{books}" for file in again for books in ("", ".json")}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return set()  # no result, or none of ours: nothing in the folder is known
     files = (path for folder in _OF_CLOUDS for path in (out / folder).glob("*"))
-    return {path for path in files if path.is_file() and path.name.startswith(starts)}
+    named = {path for path in files if path.name.startswith(starts)}
+    return {path for path in named | full if path.is_file() and path.is_relative_to(out)}

@@ -75,7 +75,11 @@ def run(
     dict
         The document of result.json.
     """
-    with scratch_folder(store.scratch / "run") as scratch, copies_in(scratch / "copies"):
+    with (
+        store.claimed(),
+        scratch_folder(store.of_run) as scratch,
+        copies_in(scratch / "copies"),
+    ):
         loader = Loader(
             folder=folder,
             recipe=project.filter,

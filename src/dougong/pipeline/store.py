@@ -7,6 +7,8 @@ registration setting therefore does not filter again, and a changed filter setti
 import hashlib
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -17,6 +19,7 @@ import numpy as np
 import dougong
 from dougong.params import Parameters
 from dougong.pipeline.books import Books, Page
+from dougong.pipeline.outputs import claim_folder, leave_folder
 from dougong.pipeline.steps import StageCount
 from dougong.tiles.folder import Folder, LocalFolder
 from dougong.typing import Kind
@@ -25,22 +28,48 @@ from dougong.typing import Kind
 class Store:
     """A folder of finished steps, and of what only the run that goes on needs."""
 
-    def __init__(self, folder: Folder, scratch: Path, *, is_temporary: bool) -> None:
+    def __init__(self, folder: Folder, scratch: Path, out: Path, *, is_temporary: bool) -> None:
         self.folder = folder
         self.scratch = scratch
         """On a disk of this machine."""
+        run = hashlib.sha256(str(out.absolute()).encode(errors="surrogateescape")).hexdigest()[:8]
+        self.of_run = scratch / f"dougong-run-{run}"
+        """Gets what is of use to the run into this result only."""
         self.is_temporary = is_temporary
 
     @classmethod
     def beside(cls, out: Path) -> "Store":
         """Return one beside the result, which is deleted once the run is done."""
         scratch = out.with_name(f"{out.name}.work")
-        return cls(LocalFolder(scratch), scratch, is_temporary=True)
+        return cls(LocalFolder(scratch), scratch, out, is_temporary=True)
 
     @classmethod
     def kept(cls, folder: Folder, out: Path) -> "Store":
         """Return one in a folder that stays; where that is on no disk, scratch is beside `out`."""
-        return cls(folder, folder.local or cls.beside(out).scratch, is_temporary=False)
+        return cls(folder, folder.local or cls.beside(out).scratch, out, is_temporary=False)
+
+    @contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Hold the folder that is deleted once the run is done: nobody else's, and not for nothing.
+
+        Raises
+        ------
+        OutputError
+            Somebody else's files are in it.
+        """
+        if not self._is_scratch_ours:
+            yield
+            return
+        claim_folder(self.scratch)
+        try:
+            yield
+        finally:
+            leave_folder(self.scratch)
+
+    @property
+    def _is_scratch_ours(self) -> bool:
+        """False: it is the folder that the user named, which stays."""
+        return self.is_temporary or self.folder.local is None
 
     def key(self, digest: str, station: int, kind: Kind, params: Parameters) -> str:
         """Return the name of a step: a hash of everything its result depends on."""
@@ -91,7 +120,7 @@ class Store:
 
     def finish(self) -> None:
         """Forget everything once the run is done, or what is not in the folder that stays."""
-        if self.is_temporary or self.folder.local is None:
+        if self._is_scratch_ours:
             shutil.rmtree(self.scratch, ignore_errors=True)
 
 

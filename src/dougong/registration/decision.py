@@ -105,6 +105,15 @@ def decide(
             status, reason, evidence = "ambiguous", OPEN_SENTENCE, _with_one_more(evidence)
         reason += " Its mirror image fits as well." if hand == "unknown" else ""
         clock.lap("mirror check")
+    if status == "ok" and hint is not None and not _is_near_yaw(T, hint, reach):
+        # No pose near it was left to be heard.
+        status, reason = (
+            "ambiguous",
+            (
+                f"the clouds fit at a yaw of {_yaw_deg(T):.0f} deg, and the hint says {hint:g}, "
+                f"within {reach:g}: nothing fits there. Check the hint, or register without it."
+            ),
+        )
     status, reason = weigh_control(status, reason, adjusted)
     listed = _listed(ruling, T, starts, source, target)
     return Found(
@@ -257,8 +266,11 @@ def _judged(
 
 
 def _is_near_yaw(T: Transform, hint_deg: float, reach_deg: float) -> bool:
-    yaw = np.degrees(np.arctan2(T[1, 0], T[0, 0]))
-    return bool(abs((yaw - hint_deg + 180.0) % 360.0 - 180.0) <= reach_deg)
+    return abs((_yaw_deg(T) - hint_deg + 180.0) % 360.0 - 180.0) <= reach_deg
+
+
+def _yaw_deg(T: Transform) -> float:
+    return float(np.degrees(np.arctan2(T[1, 0], T[0, 0])))
 
 
 def _listed(

@@ -32,9 +32,9 @@ LEFT_SENTENCE = (
 )
 OPEN_SENTENCE = (
     "the mirror image of the source lays more of it on the target, and what both images share "
-    "contradicts neither: the clouds may show two parts of a building that mirror each other, or "
-    "one file is left-handed (inscriptions then read backwards). Control points or more overlap "
-    "would decide."
+    "does not tell them apart beyond doubt: the clouds may show two parts of a building that "
+    "mirror each other, or one file is left-handed (inscriptions then read backwards). Control "
+    "points or more overlap would decide."
 )
 
 
@@ -43,9 +43,9 @@ def handedness(
 ) -> Handedness:
     """Say whether the source's mirror image fits clearly worse ("right") or better ("left").
 
-    "open": it fits better, but only by sharing more, and unseen is not empty: one wing of a
-    compound can be laid, mirrored, on the other. "unknown": the blocks cannot tell, as when all
-    that both clouds show equals its mirror image.
+    "open": it fits better, but only by sharing more or in a few blocks, and unseen is not empty:
+    one wing of a compound can be laid, mirrored, on the other. "unknown": the blocks cannot tell,
+    as when all that both clouds show equals its mirror image.
     """
     poses = propose_mirrored(court, winner, _TRIED)
     if not poses:
@@ -63,7 +63,7 @@ def handedness(
     if not _leads(compare(other, best, winner, params.block_m), params):
         return "unknown"
     shared = compare(other, best, winner, params.block_m, best.is_within & winner.is_within)
-    return "left" if _leads(shared, params) else "open"
+    return "left" if _leads(shared, params) and is_beaten(shared, params) else "open"
 
 
 def _leads(mirror: Comparison, params: Verdict) -> bool:

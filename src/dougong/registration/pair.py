@@ -156,8 +156,9 @@ def _registered(
     one, two, starts, found = best
     notes = [f"{c.name}: {n}" for c, p in ((source, one), (target, two)) for n in p.notes]
     is_judged = found.status == "ok" or found.reason == LEFT_SENTENCE
-    if not is_judged and params.coarse in ("auto", "plan"):
-        # Nothing was found to reflect: the mirror image is searched for from the start.
+    if not is_judged and params.coarse in ("auto", "plan") and params.yaw_hint_deg is None:
+        # Nothing was found to reflect: the mirror image is searched for from the start, at every
+        # heading. Where a hint left only some for the pose, it would win by that alone.
         mirror = is_mirrored(one, two, starts, params.plan)
         found = refused(mirror.sentence) if mirror.is_mirrored else found
         clock.lap("mirror check")

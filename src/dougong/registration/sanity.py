@@ -57,8 +57,8 @@ def is_mirrored(
     is_worse = other >= _MIRROR_MIN and other > _MIRROR_LEAD * plain
     sentence = (
         f"the mirror image of the source fits better than the source (score {other:.2f} against "
-        f"{plain:.2f}): one file is left-handed. Export it again with x and y in the right order "
-        "and sign (negate x, or swap x and y)."
+        f"{plain:.2f}): one file is left-handed (export it again with x and y in the right order "
+        "and sign: negate x, or swap x and y), or the clouds show two parts that mirror each other."
         if is_worse
         else ""
     )

@@ -145,7 +145,7 @@ def _facts(document: Mapping[str, Any]) -> list[tuple[str, str]]:
             ("fitness (inliers / source points)", f"{fine['fitness']:.3f}"),
             ("overlap of source, of target", _overlap(fine, bound)),
         ]
-    spread = _spread(document["covariance"])
+    spread = _spread(document["covariance"], document.get("covariance_about"))
     if spread:
         facts.append(("standard deviation of the fit", spread))
     return facts
@@ -183,12 +183,13 @@ def _overlap(fine: Mapping[str, Any], bound: str) -> str:
     return f"{100 * fine['overlap_source']:.1f} %, {100 * fine['overlap_target']:.1f} % ({bound})"
 
 
-def _spread(covariance: Sequence[Sequence[float]] | None) -> str:
+def _spread(covariance: Sequence[Sequence[float]] | None, about: Sequence[float] | None) -> str:
     if covariance is None:
         return ""
     sigma = np.sqrt(np.maximum(np.diag(np.array(covariance)), 0.0))
     turn, shift = np.degrees(np.linalg.norm(sigma[:3])), 1000 * np.linalg.norm(sigma[3:6])
-    return f"{turn:.4f} deg, {shift:.1f} mm, at the middle of the overlap"
+    at = "" if about is None else f", at {', '.join(f'{value:,.1f}' for value in about)}"
+    return f"{turn:.4f} deg, {shift:.1f} mm{at}"
 
 
 def network_rows(network: Mapping[str, Any] | None) -> list[dict[str, str]]:
