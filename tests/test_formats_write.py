@@ -318,6 +318,8 @@ def test_merged_clouds_keep_every_attribute_and_know_whose_point_is_whose(tmp_pa
     deviation = las.point_format.dimension_by_name("deviation")
     assert (deviation.scales[0], deviation.offsets[0]) == (0.01, 3.0), "still a scaled dimension"
     assert las.point_format.dimension_by_name("amplitude").description == "of the echo"
+    again = write_merged([merged], tmp_path / f"d{suffix}", source_ids=[1])
+    assert any("its own source_id is replaced" in note for note in again.notes)
 
 
 def test_merged_clouds_get_the_finest_step_and_stay_where_they_are(tmp_path):

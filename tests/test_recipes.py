@@ -57,6 +57,13 @@ def drone(cloud):
     return filter_cloud(cloud, "photogrammetry")
 
 
+def test_marking_twice_keeps_the_classes_of_the_scan(cloud, lidar):
+    once = marked(cloud, lidar.codes, lidar.ground_class)
+    nothing = np.zeros(len(cloud), np.uint8)
+    twice = marked(once, nothing, nothing)
+    np.testing.assert_array_equal(twice.attribute("classification_in"), 1)
+
+
 def test_gravestones_stand_on_the_ground():
     """Judged without the ground that they stand on they hovered: nine of ten points went."""
     rng = np.random.default_rng(3)

@@ -124,6 +124,11 @@ def _joined_header(parts: Sequence[_Part], notes: list[str]) -> LasHeader:
         offset = _kept_offset(first.offset, bounds, scale, offset)
     wide = max(part.ident for part in parts) > 255
     extras = _union([form.layout for form in forms], notes)
+    notes += [
+        f"{form.name}: its own source_id is replaced, by the number that it has in this file."
+        for form in forms
+        if "source_id" in (form.layout.names or ())
+    ]
     extras["source_id"] = np.dtype("<u2" if wide else "u1")
     known = _descriptions([form.header for form in forms], extras, notes)
     header = describe_extras(_base(first, point_format), extras, known)

@@ -81,7 +81,10 @@ def _holds(cloud: Cloud, value: int) -> bool:
 
 
 def with_classes(cloud: Cloud, classes: list[tuple[NDArray[np.bool_], int]]) -> Cloud:
-    """Return `cloud` with some points' classes set and the old ones in ``classification_in``."""
+    """Return `cloud` with some points' classes set and the old ones in ``classification_in``.
+
+    What an earlier run put there stays: it is the scan's own.
+    """
     stored = cloud.attribute("classification")
     old = np.zeros(len(cloud), np.uint8) if stored is None else stored.astype(np.uint8)
     new = old.copy()
@@ -89,6 +92,7 @@ def with_classes(cloud: Cloud, classes: list[tuple[NDArray[np.bool_], int]]) -> 
         if _holds(cloud, value):
             new[chosen] = value
     if stored is not None:
-        cloud = cloud.with_attribute("classification_in", old)
+        if cloud.attribute("classification_in") is None:
+            cloud = cloud.with_attribute("classification_in", old)
         new = new.astype(stored.dtype)
     return cloud.with_attribute("classification", new)

@@ -15,6 +15,7 @@ from dougong.formats import (
 from dougong.pipeline.memory import refuse_too_large
 from dougong.pipeline.outputs import refuse_output, watched
 from dougong.pipeline.progress import Progress
+from dougong.pipeline.project import stem
 from dougong.pipeline.registrations import finite, read_registration
 
 
@@ -49,11 +50,17 @@ def transform_file(
         notes.append(
             f"the registration is {known.status}; its best pose is applied: {known.reason}"
         )
+    scans = scans_in(input)[0]
+    if scans > 1 and known.source != stem(input):
+        notes.append(
+            f"{input.name} holds {scans} scans, and the registration is that of {known.source}: "
+            "all of them are moved by it, which is right only if they lie in one frame"
+        )
     frame = Frame(crs=known.target_crs, unit_m=known.target_unit_m)
     with watched(output):
         if can_reissue(input, output):
             progress.stage(f"moving {input.name} in chunks")
-            matrices = [known.matrix] * scans_in(input)[0]
+            matrices = [known.matrix] * scans
             written = reissue(input, output, matrices, frame, overwrite=overwrite)
         else:
             refuse_too_large([input], memory_bytes)
