@@ -57,6 +57,11 @@ def tiled(points, folder, most, grid=None, chunk=1111):
     return partition(Spool(pieces, folder), grid, LocalFolder(folder), most, most), whole
 
 
+def of_filter(notes):
+    """Return what a filter says itself: whole places that were taken are told by the pipeline."""
+    return tuple(note for note in notes if not note.startswith("took most of the points in"))
+
+
 def states(bench, points):
     """Return an array of the state over all points, by its name."""
     found = {}
@@ -81,7 +86,7 @@ def test_tiles_judge_as_the_whole(tmp_path, name, values, most):
         done = bench.apply(name, params)
     found = states(bench, len(whole.xyz))
     np.testing.assert_array_equal(found["code"] == Reason.KEPT, expected.is_kept)
-    assert done.notes == expected.notes
+    assert of_filter(done.notes) == expected.notes
     assert (done.asked, done.taken) == (len(whole.xyz), int((~expected.is_kept).sum()))
     for detail, wanted in details_of(expected).items():
         np.testing.assert_array_equal(found[detail], wanted)
@@ -142,7 +147,7 @@ def test_things_across_tiles_are_judged_as_wholes(tmp_path, points, reach_m, mos
     for detail, wanted in details_of(expected).items():
         np.testing.assert_array_equal(found[detail], wanted)
     np.testing.assert_array_equal(found["code"] == Reason.KEPT, expected.is_kept)
-    assert notes == expected.notes
+    assert of_filter(notes) == expected.notes
 
 
 def test_noise_stays_in_its_tiles(tmp_path):

@@ -19,11 +19,11 @@ from dougong.typing import Index, Points
 
 EDGE_M = 0.5
 """Edge of the cells that are looked at."""
-LEAST_HELD = 40
+LEAST_HELD = 20
 """A cell with fewer points was no place of anything."""
 SHARE = 0.6
 """A place is lost where more than this share of its points went."""
-LEAST_POINTS = 150
+LEAST_POINTS = 200
 """Fewer points in all are not spoken of."""
 _SPAN = 1 << 20
 """Cells farther apart than this are left out: 500 km."""
