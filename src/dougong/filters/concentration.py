@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.filters.octree_voxel_grid import runs_of_cells
+from dougong.filters.octree_voxel_grid import summed_cells
 from dougong.typing import Mask, Points, Values
 
 CELL_SPACINGS = 6.0
@@ -64,20 +64,13 @@ def tally(points: Points, is_kept: Mask, variation: Values, spacing_m: float) ->
     kept = is_kept.astype(np.int64)
     bends = np.rint(variation * _STEPS).astype(np.int64) * kept
     counts = np.stack([np.ones_like(kept), kept, bends], axis=1)
-    return _summed(np.floor(points / (CELL_SPACINGS * spacing_m)), counts)
+    return Tally(*summed_cells(np.floor(points / (CELL_SPACINGS * spacing_m)), counts))
 
 
 def together(parts: Sequence[Tally]) -> Tally:
     """Return the tallies of all parts of a cloud, at least one, as one: they may share cells."""
     cells = np.concatenate([part.cells for part in parts])
-    return _summed(cells, np.concatenate([part.counts for part in parts]))
-
-
-def _summed(cells: Points, counts: NDArray[np.int64]) -> Tally:
-    """Return the cells, each once, and the sums of their counts (n, 3)."""
-    places, starts = runs_of_cells(cells, cells.min(axis=0), 1.0)
-    firsts = starts[:-1]
-    return Tally(cells[places[firsts]], np.add.reduceat(counts[places], firsts, axis=0))
+    return Tally(*summed_cells(cells, np.concatenate([part.counts for part in parts])))
 
 
 def note_of(found: Tally) -> str | None:

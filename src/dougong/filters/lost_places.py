@@ -7,14 +7,14 @@ the place to look at.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.filters.octree_voxel_grid import runs_of_cells
+from dougong._boxes import are_within
+from dougong._sorting import grouped, keys_of_rows
+from dougong.filters.octree_voxel_grid import summed_cells
 from dougong.typing import Index, Points
 
 EDGE_M = 0.5
@@ -27,19 +27,6 @@ LEAST_POINTS = 200
 """Fewer points in all are not spoken of."""
 _SPAN = 1 << 20
 """Cells farther apart than this are left out: 500 km."""
-
-
-class Cells(NamedTuple):
-    """Some cells, each once, and how many points each has."""
-
-    cells: NDArray[np.int64]
-    """(m, 3) whole numbers of `EDGE_M`."""
-    counts: Index
-    """(m,)."""
-
-    def where(self, chosen: NDArray[np.bool_]) -> Cells:
-        """Return some of them."""
-        return Cells(self.cells[chosen], self.counts[chosen])
 
 
 Taken = Callable[[], Iterable[Points]]
@@ -57,18 +44,23 @@ def lost_places(taken: Taken, asked: Taken, origin: NDArray[np.float64]) -> str 
     origin : ndarray, shape (3,)
         Of the local frame: places are told in the file's coordinates.
     """
-    crowded = _dense(_together([_counted(points) for points in taken() if len(points)]))
-    if not len(crowded.counts):
+    parts = [_counted(points) for points in taken() if len(points)]
+    if not parts:
         return None
-    held = sum((_held(points, crowded.cells) for points in asked()), np.zeros(1, np.int64))
-    is_lost = (held >= LEAST_HELD) & (crowded.counts > SHARE * held)
-    lost = crowded.where(is_lost)
-    points = int(lost.counts.sum())
+    cells, gone = summed_cells(*map(np.concatenate, zip(*parts, strict=True)))
+    is_crowded = gone > SHARE * LEAST_HELD
+    cells, gone = cells[is_crowded], gone[is_crowded]
+    if not len(gone):
+        return None
+    held = sum((_held(points, cells) for points in asked()), np.zeros(1, np.int64))
+    is_lost = (held >= LEAST_HELD) & (gone > SHARE * held)
+    cells, gone = cells[is_lost], gone[is_lost]
+    points = int(gone.sum())
     if points < LEAST_POINTS:
         return None
-    most = (lost.cells[np.argmax(lost.counts)] + 0.5) * EDGE_M + origin
+    most = (cells[np.argmax(gone)] + 0.5) * EDGE_M + origin
     x, y, z = (f"{value:,.1f}" for value in most.tolist())
-    places = f"{len(lost.counts):,} places" if len(lost.counts) > 1 else "one place"
+    places = f"{len(gone):,} places" if len(gone) > 1 else "one place"
     return (
         f"took most of the points in {places} of {EDGE_M} m, {points:,} in all, most at x {x}, "
         f"y {y}, z {z}: noise is seldom so dense. Look there with --mark, whether something stood "
@@ -76,46 +68,24 @@ def lost_places(taken: Taken, asked: Taken, origin: NDArray[np.float64]) -> str 
     )
 
 
-def _counted(points: Points) -> Cells:
+def _counted(points: Points) -> tuple[Points, Index]:
+    """Return the cells of points (n, 3), n >= 1, each once, and how many points each has."""
     cells = np.floor(points / EDGE_M)
     middle = np.median(cells, axis=0)
     cells = cells[(np.abs(cells - middle) < _SPAN / 2).all(axis=1)]
-    return _summed(cells, np.ones(len(cells), np.int64))
-
-
-def _summed(cells: Points, counts: Index) -> Cells:
     if not len(cells):
-        return Cells(np.zeros((0, 3), np.int64), np.zeros(0, np.int64))
-    places, starts = runs_of_cells(cells, cells.min(axis=0), 1.0)
-    firsts = places[starts[:-1]]
-    return Cells(cells[firsts].astype(np.int64), np.add.reduceat(counts[places], starts[:-1]))
+        return cells, np.zeros(0, np.int64)
+    return summed_cells(cells, np.ones(len(cells), np.int64))
 
 
-def _together(parts: list[Cells]) -> Cells:
-    if not parts:
-        return Cells(np.zeros((0, 3), np.int64), np.zeros(0, np.int64))
-    cells = np.concatenate([part.cells for part in parts]).astype(np.float64)
-    return _summed(cells, np.concatenate([part.counts for part in parts]))
-
-
-def _dense(found: Cells) -> Cells:
-    return found.where(found.counts > SHARE * LEAST_HELD)
-
-
-def _held(points: Points, cells: NDArray[np.int64]) -> Index:
-    """Return how many of `points` (n, 3) each of the cells (m, 3) holds."""
-    low, high = cells.min(axis=0), cells.max(axis=0)
-    spans = (high - low + 1).tolist()
-    if math.prod(spans) >= 1 << 63:
-        return np.full(len(cells), np.iinfo(np.int64).max // 2)
+def _held(points: Points, cells: Points) -> Index:
+    """Return how many of `points` (n, 3) each of the cells (m, 3), m >= 1, holds."""
     at = np.floor(points / EDGE_M)
-    at = at[((at >= low) & (at <= high)).all(axis=1)].astype(np.int64)
-    strides = np.array([spans[1] * spans[2], spans[2], 1])
-    keys, mine = (at - low) @ strides, (cells - low) @ strides
-    order = np.argsort(mine)
-    place = np.searchsorted(mine[order], keys)
-    place[place == len(mine)] = 0
-    is_in = mine[order][place] == keys
-    counts = np.zeros(len(cells), np.int64)
-    counts[order] = np.bincount(place[is_in], minlength=len(cells))
-    return counts
+    near = at[are_within(at, cells.min(axis=0), cells.max(axis=0))]
+    # Each cell counts itself once.
+    columns = np.concatenate([cells, near]).astype(np.int64).T
+    keys = keys_of_rows(tuple(columns))
+    if keys is None:
+        return np.full(len(cells), np.iinfo(np.int64).max // 2)
+    found = grouped(keys)
+    return found.counts[found.place[: len(cells)]] - 1

@@ -258,6 +258,13 @@ def runs_of_cells(xyz: Points, low: NDArray[np.float64], voxel_m: float) -> tupl
     return np.concatenate((places, outside[by_cell])), starts
 
 
+def summed_cells(cells: Points, counts: NDArray[np.int64]) -> tuple[Points, NDArray[np.int64]]:
+    """Return cells (n, 3), n >= 1, each once, and the sums of their counts (n,) or (n, k)."""
+    places, starts = runs_of_cells(cells, cells.min(axis=0), 1.0)
+    firsts = starts[:-1]
+    return cells[places[firsts]], np.add.reduceat(counts[places], firsts, axis=0)
+
+
 def _settle_twins(
     xyz: Points,
     records_at: Callable[[Index], NDArray[Any]],

@@ -232,7 +232,11 @@ def run_curvature_weighted(
 ) -> None:
     """Take out isolated points while edges and brackets stay (CWASF)."""
     counts = bench.voxel_count
-    beside = None if among is None else bench.cloud.xyz[np.setdiff1d(bench.left(), among, True)]
+    beside = None
+    if among is not None:
+        is_beside = bench.codes == Reason.KEPT
+        is_beside[among] = False
+        beside = bench.cloud.xyz[is_beside]
     bench.apply(
         "curvature_weighted",
         Reason.CURVATURE_WEIGHTED,

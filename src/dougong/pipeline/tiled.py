@@ -218,7 +218,6 @@ def _cut(
     told = {
         "name": first.name,
         "notes": list(first.notes),
-        "origin": first.frame.origin.tolist(),
     }
     return partition(spool, job.grid, folder, most, most_kept, told)
 

@@ -64,17 +64,13 @@ def decide(
     court = summon(source, target)
     quick = _quick(_icp(params), source, target)
     levels = build_levels(source, target, quick)
-    hint, reach = params.yaw_hint_deg, params.plan.yaw_hint_range_deg
     ruling = rule(
         court,
         levels,
         [h.T_target_source for h in starts],
         quick,
         params.verdict,
-        lambda T: (
-            (hint is None or _is_near_yaw(T, hint, reach))
-            and (control is None or control.allows(T))
-        ),
+        lambda T: _is_near_hint(T, params) and (control is None or control.allows(T)),
     )
     clock.lap("proof")
     fine, adjusted = _refined(source, target, ruling, params, control)
@@ -105,15 +101,8 @@ def decide(
             status, reason, evidence = "ambiguous", OPEN_SENTENCE, _with_one_more(evidence)
         reason += " Its mirror image fits as well." if hand == "unknown" else ""
         clock.lap("mirror check")
-    if status == "ok" and hint is not None and not _is_near_yaw(T, hint, reach):
-        # No pose near it was left to be heard.
-        status, reason = (
-            "ambiguous",
-            (
-                f"the clouds fit at a yaw of {_yaw_deg(T):.0f} deg, and the hint says {hint:g}, "
-                f"within {reach:g}: nothing fits there. Check the hint, or register without it."
-            ),
-        )
+    if status == "ok" and not _is_near_hint(T, params):
+        status, reason = "ambiguous", _off_hint(T, params)
     status, reason = weigh_control(status, reason, adjusted)
     listed = _listed(ruling, T, starts, source, target)
     return Found(
@@ -265,8 +254,19 @@ def _judged(
     return status, f"{reason} {agree}", spread
 
 
-def _is_near_yaw(T: Transform, hint_deg: float, reach_deg: float) -> bool:
-    return abs((_yaw_deg(T) - hint_deg + 180.0) % 360.0 - 180.0) <= reach_deg
+def _is_near_hint(T: Transform, params: Register) -> bool:
+    """Say whether a pose is turned as the yaw hint says; any is where there is none."""
+    hint, reach = params.yaw_hint_deg, params.plan.yaw_hint_range_deg
+    return hint is None or abs((_yaw_deg(T) - hint + 180.0) % 360.0 - 180.0) <= reach
+
+
+def _off_hint(T: Transform, params: Register) -> str:
+    """Return what is to be said where no pose near the hint was left to be heard."""
+    return (
+        f"the clouds fit at a yaw of {_yaw_deg(T):.0f} deg, and the hint says "
+        f"{params.yaw_hint_deg:g}, within {params.plan.yaw_hint_range_deg:g}: nothing fits there. "
+        "Check the hint, or register without it."
+    )
 
 
 def _yaw_deg(T: Transform) -> float:

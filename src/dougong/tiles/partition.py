@@ -74,7 +74,12 @@ def partition(
     faults = faults_in_words(
         spool.first.frame, points=spool.points, copies=copies, far=far, sample=sample
     )
-    tiled = TiledCloud(folder, tiles, {**(told or {}), "points_in": spool.points, "faults": faults})
+    facts = {
+        "points_in": spool.points,
+        "faults": faults,
+        "origin": spool.first.frame.origin.tolist(),
+    }
+    tiled = TiledCloud(folder, tiles, {**(told or {}), **facts})
     tiled.save()
     return tiled
 

@@ -7,7 +7,7 @@ goes on where it was and a changed parameter reruns only what depends on it.
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -34,6 +34,7 @@ from dougong.filters.wires import are_rows
 from dougong.params import Parameters
 from dougong.tiles import nearest, protective, things, work
 from dougong.tiles.cloud import (
+    POINTS,
     Arrays,
     Record,
     Tile,
@@ -92,7 +93,7 @@ class TileBench:
         records, notes, self.state = _RUN[name](stage)
         totals = {key: sum(r[key] for r in records) for key in ("left", "asked", "taken")}
         if FILTERS[name].reason in NOISE:
-            notes = (*notes, *stage.lost_places(self.state, self.cloud.facts.get("origin")))
+            notes = (*notes, *stage.lost_places(self.state))
         done = StageDone(
             name=name,
             notes=notes,
@@ -161,16 +162,18 @@ class _Stage:
             job = Job(self.cloud.folder, tile, self.before, self.params, self.among)
             yield asked_points(job, tile)
 
-    def lost_places(self, after: str, origin: Sequence[float] | None) -> tuple[str, ...]:
+    def lost_places(self, after: str) -> tuple[str, ...]:
         """Return what is to be said where this stage, which left the state `after`, took places."""
 
         def taken() -> Iterator[Points]:
-            for tile, points in zip(self.cloud.tiles, self.blocks(), strict=True):
-                code = read_arrays(self.cloud.folder, tile, after, "code")["code"]
-                yield points[code[self.mask(tile)] != Reason.KEPT]
+            folder = self.cloud.folder
+            for tile in self.cloud.tiles:
+                code = read_arrays(folder, tile, after, "code")["code"]
+                is_taken = self.mask(tile) & (code != Reason.KEPT)
+                if is_taken.any():
+                    yield read_arrays(folder, tile, POINTS, "xyz")["xyz"][is_taken]
 
-        place = np.zeros(3) if origin is None else np.asarray(origin)
-        note = lost_places(taken, self.blocks, place)
+        note = lost_places(taken, self.blocks, np.array(self.cloud.facts["origin"]))
         return () if note is None else (note,)
 
     def values(self, stage: str, name: str) -> ValueBlocks:
