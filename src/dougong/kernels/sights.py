@@ -22,7 +22,9 @@ def hidden_shares(
     """Return the share of `points` (n, 3) that is hidden from places (k, 3), start .. stop - 1.
 
     Directions are rows x 2 rows cells of elevation and azimuth; a point is hidden that is farther
-    than factor * r + extra, r the nearest range in its cell. out (k,).
+    than factor * r + extra, r the nearest range in its cell, and the nearest in the cell beside it
+    towards the horizon: ground that runs away from the place has many ranges in one cell, but what
+    hides a point stands up before it. out (k,).
     """
     n = points.shape[0]
     nearest = np.empty(2 * rows * rows)
@@ -44,5 +46,7 @@ def hidden_shares(
             nearest[cell] = min(nearest[cell], distance)
         hidden = 0
         for i in range(n):
-            hidden += ranges[i] > factor * nearest[cells[i]] + extra
+            towards = 2 * rows if cells[i] < rows * rows else -2 * rows
+            least = max(nearest[cells[i]], nearest[cells[i] + towards])
+            hidden += ranges[i] > factor * least + extra
         out[k] = hidden / n

@@ -31,6 +31,9 @@ _TRIED_STEP_M = 2.0
 _MOST_TRIED = 1200
 _EYE_M = 1.6
 _EYE_SPREAD_M = 1.5
+_OFF_EYE = 0.004
+"""A metre off eye height counts as this share of hidden points: from higher up less is hidden
+anyway."""
 _BESIDE_M = 4.0
 _TRIED_CELL = np.radians(3.0)
 _FOUND_CELL = np.radians(2.0)
@@ -100,8 +103,7 @@ def find_place(points: Points) -> NDArray[np.float64] | None:
 
     From its own place a scan has one range per direction; from elsewhere surfaces hide others.
     Places at eye height are tried all over the plan, and the best is shifted while it gets better.
-    Good to about a metre in plan; the height comes out up to 1.5 m too high, since level ground has
-    many ranges within one cell at grazing angles.
+    Good to about a metre in plan and half a metre in height.
     Scans from several stations hide points from everywhere, and a single wall hides none from
     anywhere: both have no answer.
     """
@@ -124,12 +126,13 @@ def find_place(points: Points) -> NDArray[np.float64] | None:
 
 def _settled(points: Points, place: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
     """Return how little is hidden from the best place near `place`, and that place."""
-    least, step = float(_hidden(points, place[None], _FOUND_CELL)[0]), 1.0
-    lowest, highest = place[2] - _EYE_SPREAD_M, place[2] + _EYE_SPREAD_M
+    eye, step = place[2], 1.0
+    least = float(_hidden(points, place[None], _FOUND_CELL)[0])
+    lowest, highest = eye - _EYE_SPREAD_M, eye + _EYE_SPREAD_M
     while step > _FINEST_M:
         around = place + step * _MOVES
         around = around[(lowest <= around[:, 2]) & (around[:, 2] <= highest)]
-        costs = _hidden(points, around, _FOUND_CELL)
+        costs = _hidden(points, around, _FOUND_CELL) + _OFF_EYE * np.abs(around[:, 2] - eye)
         if costs.min() < least:
             least, place = float(costs.min()), around[int(np.argmin(costs))]
         else:
