@@ -1,7 +1,7 @@
 """Make a cloud ready for registration: the same few facts about every cloud, raw or filtered."""
 
-from dataclasses import dataclass, field, replace
-from typing import Annotated, NamedTuple
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -119,6 +119,15 @@ class Prepared:
     def up(self) -> Values:
         """Return the vertical (3,) to search with: z, or what the walls proved."""
         return self.levelling.up if self.is_relevelled else np.array([0.0, 0.0, 1.0])
+
+    def chosen(self, is_chosen: Mask) -> "Prepared":
+        """Return the cloud with the chosen (n,) of its points only."""
+        per_point: dict[str, Any] = {
+            item.name: value[is_chosen]
+            for item in fields(self)
+            if isinstance(value := getattr(self, item.name), np.ndarray)
+        }
+        return replace(self, **per_point)
 
 
 def prepare(cloud: Cloud, kind: Kind, params: Prepare | None = None) -> Prepared:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from dougong.registration.icp_solve import (
     with_prior,
 )
 from dougong.registration.overlap import Pairs, Rung, find_pairs
-from dougong.registration.prepare import Prepared
+from dougong.registration.prepare import MIN_POINTS, Prepared
 from dougong.typing import Index, Mask, Transform, Values
 
 FREE_WITH_SCALE = {5: (2, 3, 4, 5, 6), 7: (0, 1, 2, 3, 4, 5, 6)}
@@ -33,6 +34,8 @@ _FLOOR = 1e-5
 _FACING = 0.3
 _LEAST_FACING_SHARE = 0.02
 _LEAST_FACING_BLOCKS = 3
+_sure: WeakKeyDictionary[Prepared, Prepared] = WeakKeyDictionary()
+"""Clouds without unsure roofs: a search fits many scales, and their search indices are kept."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +85,38 @@ def fit_similarity(
     -------
     SimilarityFit or None
         None: the clouds have too little in common near `T`.
+
+    Notes
+    -----
+    Roofs of which nobody knows the side are left out where the rest holds the scale: the undersides
+    that a scanner saw, laid on the tops that a flight saw, made a pagoda 0.8 % too small.
     """
+    sure = _without_unsure_roofs(source), _without_unsure_roofs(target)
+    if sure != (source, target):
+        fit = _fit(*sure, T, side, icp, dof)
+        if fit is not None and fit.holds_scale:
+            return fit
+    return _fit(source, target, T, side, icp, dof)
+
+
+def _without_unsure_roofs(cloud: Prepared) -> Prepared:
+    """Return the cloud without roofs of unknown side; itself where there are none, or all are."""
+    is_sure = ~np.broadcast_to(cloud.side_is_unknown, len(cloud.xyz))
+    if is_sure.all() or int(is_sure.sum()) < MIN_POINTS:
+        return cloud
+    if cloud not in _sure:
+        _sure[cloud] = cloud.chosen(is_sure)
+    return _sure[cloud]
+
+
+def _fit(
+    source: Prepared,
+    target: Prepared,
+    T: Transform,
+    side: Literal["source", "target"],
+    icp: Icp,
+    dof: int,
+) -> SimilarityFit | None:
     free = FREE_WITH_SCALE[dof]
     if dof == 5:
         T = levelled(T, target.xyz.mean(axis=0))
