@@ -18,7 +18,7 @@ from typing import Any
 
 from places import make
 
-from dougong.evaluation.hard import CASES, OTHER_PLACE, SCENES, cases_on, run
+from dougong.evaluation.hard import CASES, COPY_CASES, OTHER_PLACE, PLACES, cases_on, run
 from dougong.evaluation.hard_trials import Base
 from dougong.evaluation.studies.hard import summary
 from dougong.evaluation.studies.hard import text as in_words
@@ -36,8 +36,8 @@ def line(row: dict[str, Any]) -> str:
 def main() -> None:
     """Run what the command line asks for; exit 1 when any pair is WRONG."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--cases", default=",".join([*CASES, OTHER_PLACE]))
-    parser.add_argument("--scenes", default=",".join(SCENES))
+    parser.add_argument("--cases", default=",".join([*CASES, *COPY_CASES, OTHER_PLACE]))
+    parser.add_argument("--scenes", default=",".join(PLACES))
     parser.add_argument("--seeds", default="0", help="numbers, by commas")
     parser.add_argument("--rows", type=Path, help="JSON lines: read, not made again, added to")
     asked = parser.parse_args()

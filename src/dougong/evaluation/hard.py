@@ -23,6 +23,7 @@ import numpy as np
 
 from dougong.cloud import Cloud
 from dougong.errors import DougongError
+from dougong.evaluation.copies import COPIES, make_trial
 from dougong.evaluation.hard_trials import (
     Base,
     Trial,
@@ -53,6 +54,7 @@ LIGHT = {"lidar_points": 150_000, "photogrammetry_points": 100_000}
 GENERATED = tuple(BUILDERS)
 MESHES = ("nuyda", "monastery")
 SCENES = (*GENERATED, *MESHES)
+PLACES = (*SCENES, *COPIES)
 Maker = Callable[..., Scene]
 """(name, seed, site=, woods=, and numbers of points) -> the survey of a place."""
 
@@ -105,12 +107,37 @@ CASES: dict[str, Case] = {
     "halls-1-of-3": Case(make=halls(1, 3), expected="ambiguous", has_site=False, scenes=("hall",)),
     "halls-2-of-3": Case(make=halls(2, 3), expected="ambiguous", has_site=False, scenes=("hall",)),
 }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CopyCase:
+    """Two surveys of a place that repeats (`copies`), and the answer they must get."""
+
+    is_copy: bool
+    things: int
+    expected: Expected
+    refused_on: tuple[str, ...] = ()
+    """Places whose copy is no part of the same site: no motion is true."""
+
+    def expected_on(self, place: str) -> Expected:
+        """Return the answer that a place must get."""
+        return "refused" if place in self.refused_on else self.expected
+
+
+COPY_CASES: dict[str, CopyCase] = {
+    "copy": CopyCase(is_copy=True, things=8, expected="honest", refused_on=("twins",)),
+    "copy-bare": CopyCase(is_copy=True, things=0, expected="honest", refused_on=("twins",)),
+    "same-part": CopyCase(is_copy=False, things=12, expected="right"),
+    "same-bare": CopyCase(is_copy=False, things=0, expected="honest"),
+}
 OTHER_PLACE = "other-place"
 """The scan of one seed against the flight over the next one (of a mesh: over another place)."""
 
 
 def cases_on(scene: str) -> list[str]:
-    """Return the names of the cases that a scene is put through."""
+    """Return the names of the cases that a scene, or a place that repeats, is put through."""
+    if scene in COPIES:
+        return list(COPY_CASES)
     return [*(name for name, case in CASES.items() if scene in case.scenes), OTHER_PLACE]
 
 
@@ -137,8 +164,12 @@ def run(
         return cache[key]
 
     rng = np.random.default_rng([seed, *name.encode()])
-    if name == OTHER_PLACE:
-        expected: Expected = "refused"
+    if kind in COPIES:
+        copied = COPY_CASES[name]
+        expected: Expected = copied.expected_on(kind)
+        trial = make_trial(kind, seed, is_copy=copied.is_copy, things=copied.things, **size)
+    elif name == OTHER_PLACE:
+        expected = "refused"
         other = SCENES[(SCENES.index(kind) + 1) % len(SCENES)] if kind in MESHES else kind
         flown = base_of(make(other, seed + 1, **size)).drone
         mixed = replace(base(seed), drone=flown)

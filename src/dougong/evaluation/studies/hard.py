@@ -1,7 +1,8 @@
 """Hard and impossible pairs: the matrix of scenes, cases and seeds, by verdict.
 
-Five generated scenes; with a data folder also its two meshes. The answer that each case must get
-is written down in `dougong.evaluation.hard`. A run that is stopped goes on where it was.
+Five generated scenes and six places that repeat; with a data folder also its two meshes. The
+answer that each case must get is written down in `dougong.evaluation.hard`. A run that is stopped
+goes on where it was.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dougong.errors import InputError
+from dougong.evaluation.copies import COPIES
 from dougong.evaluation.hard import GENERATED, OTHER_PLACE, SCENES, Maker, cases_on, is_missed, run
 from dougong.evaluation.hard_trials import Base
 from dougong.evaluation.mesh import load_mesh
@@ -32,7 +34,7 @@ FILES = {
 def study(setting: Setting, progress: Progress) -> Findings:
     """Put every scene through every case; quick: the hall, five cases, fewer points."""
     scenes = GENERATED if setting.data is None else SCENES
-    scenes = scenes[:1] if setting.is_quick else scenes
+    scenes = scenes[:1] if setting.is_quick else (*scenes, *COPIES)
     make = maker(setting.data)
     surveys: dict[Any, Base] = {}
 
