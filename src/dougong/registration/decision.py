@@ -15,6 +15,7 @@ from dougong.registration.evidence import Court, hear, summon
 from dougong.registration.handedness import LEFT_SENTENCE, OPEN_SENTENCE, handedness
 from dougong.registration.icp import Icp, build_levels, refine
 from dougong.registration.laps import Laps
+from dougong.registration.look_alikes import look_alike_doubt
 from dougong.registration.overlap import apply
 from dougong.registration.prepare import Prepared
 from dougong.registration.probability import BELIEF, Evidence
@@ -82,6 +83,10 @@ def decide(
         pulled = _weigh_points(source, target, ruling, fine, params)
         if pulled is not None:
             (status, reason), evidence = pulled, replace(evidence, spread_m=np.inf)
+    if status == "ok":
+        alike = look_alike_doubt(court, source, target, ruling, params.verdict)
+        if alike is not None:
+            status, reason, evidence = "ambiguous", alike, _with_one_more(evidence)
     if status == "ok" and fine is not None:
         doubt = size_doubt(source, target, T, _icp(params), params.verdict.most_spread_m)
         if doubt is not None:

@@ -86,6 +86,13 @@ def in_words(moves: Sequence[Move]) -> str:
     )
 
 
+def in_short(move: Move) -> str:
+    """Return one move in a few words."""
+    if move.is_turn:
+        return f"turned by {move.turn_deg:+.0f} deg"
+    return f"shifted by {float(np.linalg.norm(move.shift)):.2g} m"
+
+
 def _turns_in_words(turns: Sequence[Move]) -> str:
     degrees = sorted({round(move.turn_deg) for move in turns}, key=abs)
     listed = ", ".join(f"{turn:+d} deg" for turn in degrees[:7])

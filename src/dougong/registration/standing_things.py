@@ -1,0 +1,269 @@
+"""What stands about: small things apart from all else, and whether the other cloud shows them.
+
+A building's copy fits as well as the building: the opposite corner, the next gallery, the twin
+house. What stands about is nowhere twice. A thing of one cloud is *found* where the other shows
+something standing in its place, *gone* where the other shows the bare ground it stood on, and says
+nothing where the other shows neither. Things come and go between two surveys, so a true pose too
+leaves some gone; but a wrong one finds no more of them than chance does. Things that a rival pose
+finds as well (the columns of an arcade, two lions at a gate) repeat as the building does and are
+not asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binom
+
+from dougong.filters.clusters import clusters_of, members
+from dougong.filters.clutter_shapes import Shape, shape_of
+from dougong.filters.neighbourhood import Neighbourhood, build_index, nearest
+from dougong.registration.overlap import Rung, apply, inverse
+from dougong.registration.prepare import Prepared
+from dougong.typing import Index, Mask, Points, Transform, Values
+
+_FOOT_M = 0.35
+"""Lower than this above the ground is the ground's own roughness, kerbs and grass."""
+_TOP_M = 0.6
+_LARGEST_M = 6.0
+_FEWEST = 15
+_GAP_M = 0.3
+_GAP_SPACINGS = 2.5
+_ASKED = 64
+"""Points of a thing that are looked for."""
+_CELL_M = 0.5
+_MOST_CELLS = 2000
+"""Along one side of the picture of the floor."""
+_SAME_FLOOR_M = 0.5
+_FOUND = 0.4
+"""A thing is found by so much of it: from another side another part of it is seen."""
+_CLOSE_M = 0.5
+_LEFT = 0.1
+"""Of what is gone no more than this share is left, ..."""
+_BARE = 0.5
+"""... and on so much of its place the other cloud shows the ground."""
+_BESIDE_M = (4.0, 7.0)
+"""Chance is measured by moving everything so far in eight directions."""
+_PRIOR = (1.0, 10.0)
+"""One thing in ten is found by chance where nothing is known of it."""
+_MANY = 3
+"""Fewer things gone say nothing."""
+_BY_CHANCE = 0.05
+_BEYOND_CHANCE = 0.005
+_PERSON_M = ((0.9, 2.2), 1.1)
+"""Top above the ground, longest side in plan of what may have walked away ..."""
+_VEHICLE_M = ((1.1, 2.8), (2.6, 6.0), (1.2, 2.6))
+"""... and top, length and width of what may have driven off: gone, it says nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fates:
+    """What became of the things of both clouds, the source's first, under one pose."""
+
+    is_found: Mask
+    is_gone: Mask
+
+
+class _Floor(NamedTuple):
+    """The height of the ground in plan, NaN where a cloud shows none."""
+
+    low: NDArray[np.float64]
+    cell_m: float
+    height: NDArray[np.float64]
+
+    def at(self, points: Points) -> Values:
+        """Return the height (n,) of the ground at `points` (n, 3)."""
+        place = np.floor((points[:, :2] - self.low) / self.cell_m)
+        is_on = np.all((place >= 0) & (place < self.height.shape), axis=1)
+        i, j = np.where(is_on[:, None], place, 0.0).astype(np.int64).T
+        height: Values = np.where(is_on, self.height[i, j], np.nan)
+        return height
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Side:
+    """The things of one cloud, and what it shows in the places of others'."""
+
+    points: Points
+    """(k, 3) of the things, above their foot."""
+    height: Values
+    """(k,) above the ground."""
+    thing: Index
+    """(k,) which thing, 0 .. count - 1."""
+    may_go: Mask
+    """(count,) of the size of a person or a vehicle."""
+    standing: Neighbourhood
+    """All of the cloud that stands above the ground."""
+    floor: _Floor
+
+    @property
+    def count(self) -> int:
+        """Return how many things there are."""
+        return len(self.may_go)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Telling:
+    """How many of the things that are nowhere twice a pose finds."""
+
+    found: int
+    gone: int
+    chance: float
+    """Share of them that is found metres beside the pose."""
+
+    @property
+    def is_refuted(self) -> bool:
+        """Say whether enough is gone, and no more found than by chance."""
+        return self.gone >= _MANY and self._by_chance() > _BY_CHANCE
+
+    @property
+    def is_vouched(self) -> bool:
+        """Say whether more is found than by chance."""
+        return self.found >= _MANY and self._by_chance() <= _BEYOND_CHANCE
+
+    def _by_chance(self) -> float:
+        return float(binom.sf(self.found - 1, self.found + self.gone, self.chance))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Things:
+    """The things of both clouds of a pair."""
+
+    source: _Side
+    target: _Side
+    near_m: float
+    """Two views of one surface lie no farther apart than this."""
+
+    def fates(self, T: Transform) -> Fates:
+        """Return what a pose (source -> target) says of every thing."""
+        one = _fates(self.source, self.target, T, self.near_m)
+        two = _fates(self.target, self.source, inverse(T), self.near_m)
+        found, gone = zip(one, two, strict=True)
+        return Fates(is_found=np.concatenate(found), is_gone=np.concatenate(gone))
+
+    def chance(self, T: Transform, asked: Mask) -> float:
+        """Return which share of the `asked` things is found by chance, metres beside a pose."""
+        found, tries = _PRIOR
+        for reach in _BESIDE_M:
+            for turn in np.arange(8) * (np.pi / 4.0):
+                beside = T.copy()
+                beside[:2, 3] += reach * np.array([np.cos(turn), np.sin(turn)])
+                fate = self.fates(beside)
+                found += int((asked & fate.is_found).sum())
+                tries += int((asked & (fate.is_found | fate.is_gone)).sum())
+        return float(found / tries)
+
+    def telling(self, T: Transform, rivals: Sequence[Transform]) -> Telling:
+        """Return how many things are found and gone under a pose, without what proves nothing.
+
+        `rivals`: poses of other places; what is found there too is not counted. Nor is gone what
+        may have walked or driven away.
+        """
+        fate = self.fates(T)
+        is_asked = np.ones(len(fate.is_found), bool)
+        for rival in rivals:
+            is_asked &= ~self.fates(rival).is_found
+        may_go = np.concatenate([self.source.may_go, self.target.may_go])
+        return Telling(
+            found=int((fate.is_found & is_asked).sum()),
+            gone=int((fate.is_gone & is_asked & ~may_go).sum()),
+            chance=self.chance(T, is_asked),
+        )
+
+    def speak_for(self, rival: Transform, winner: Transform) -> int:
+        """Return how many things gone under the winner are found under a rival; 0: by chance."""
+        first, second = self.fates(winner), self.fates(rival)
+        gone, back = int(first.is_gone.sum()), int((first.is_gone & second.is_found).sum())
+        if back < 2:
+            return 0
+        chance = self.chance(rival, first.is_gone)
+        return back if binom.sf(back - 1, gone, chance) <= _BEYOND_CHANCE else 0
+
+
+def things_of(
+    source: tuple[Prepared, Rung], target: tuple[Prepared, Rung], near_m: float
+) -> Things:
+    """Return what stands about in two clouds, each with a rung of it."""
+    return Things(source=_side(*source), target=_side(*target), near_m=near_m)
+
+
+def _side(prepared: Prepared, everything: Rung) -> _Side:
+    """Return the things of a cloud that stand on the ground by themselves, up to 6 m wide."""
+    is_ground = prepared.is_ground[everything.index]
+    height = prepared.height_above_ground[everything.index]
+    is_standing = ~is_ground & (height > _FOOT_M)
+    index = build_index(everything.xyz[is_standing])
+    height = height[is_standing][index.order]
+    stand = _standing(index, height, everything.spacing_m) if prepared.has_ground else []
+    asked = [places[:: -(-len(places) // _ASKED)] for places in stand]
+    places = np.concatenate([np.zeros(0, np.int64), *asked])
+    may_go = [_may_go(shape_of(index.points[thing], height[thing])) for thing in stand]
+    return _Side(
+        points=index.points[places],
+        height=height[places],
+        thing=np.repeat(np.arange(len(asked)), [len(places) for places in asked]),
+        may_go=np.array(may_go, dtype=bool),
+        standing=index,
+        floor=_floor(everything.xyz[is_ground], everything.spacing_m),
+    )
+
+
+def _standing(index: Neighbourhood, height: Values, spacing_m: float) -> list[Index]:
+    """Return the places of the points of each thing."""
+    gap = max(_GAP_M, _GAP_SPACINGS * spacing_m)
+    clusters = clusters_of(index, np.full(len(index.points), gap), gap)
+    is_small = (clusters.held >= _FEWEST) & (clusters.longest_m < _LARGEST_M)
+    return [
+        places
+        for places in members(clusters, np.flatnonzero(is_small))
+        if height[places].min() < _FOOT_M + gap and height[places].max() > _TOP_M
+    ]
+
+
+def _may_go(shape: Shape) -> bool:
+    (low, high), long = _PERSON_M
+    is_person = low < shape.top_m < high and shape.length_m < long
+    is_vehicle = all(
+        low < value < high
+        for value, (low, high) in zip(
+            (shape.top_m, shape.length_m, shape.width_m), _VEHICLE_M, strict=True
+        )
+    )
+    return is_person or is_vehicle
+
+
+def _floor(ground: Points, spacing_m: float) -> _Floor:
+    if not len(ground):
+        return _Floor(np.zeros(2), 1.0, np.full((1, 1), np.nan))
+    low = ground[:, :2].min(axis=0)
+    widest = float((ground[:, :2].max(axis=0) - low).max())
+    cell = max(_CELL_M, 2.0 * spacing_m, widest / _MOST_CELLS)
+    i, j = np.floor((ground[:, :2] - low) / cell).astype(np.int64).T
+    height = np.full((int(i.max()) + 1, int(j.max()) + 1), np.inf)
+    np.minimum.at(height, (i, j), ground[:, 2])
+    return _Floor(low, cell, np.where(np.isfinite(height), height, np.nan))
+
+
+def _fates(from_: _Side, to: _Side, T: Transform, near_m: float) -> tuple[Mask, Mask]:
+    """Return which things of one cloud the other shows, and which it shows to be gone."""
+    if not from_.count or not len(to.standing.points):
+        return np.zeros(from_.count, bool), np.zeros(from_.count, bool)
+    held = np.bincount(from_.thing, minlength=from_.count)
+
+    def share(is_so: Mask) -> Values:
+        counted: Values = np.bincount(from_.thing[is_so], minlength=from_.count) / held
+        return counted
+
+    moved = apply(T, from_.points)
+    close = max(_CLOSE_M, near_m)
+    at, distance = nearest(to.standing, moved, close)
+    distance = np.where(at >= 0, distance, np.inf)
+    # NaN, where no ground is shown, compares false.
+    is_bare = np.abs(to.floor.at(moved) - (moved[:, 2] - from_.height)) < _SAME_FLOOR_M
+    is_found = share(distance <= near_m) >= _FOUND
+    is_gone = (share(distance <= close) <= _LEFT) & (share(is_bare) >= _BARE)
+    return is_found, is_gone

@@ -1,0 +1,218 @@
+"""What stands about and the ground tell a place from its copy."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dougong.cloud import Cloud
+from dougong.evaluation.copies import COPIES, make_trial
+from dougong.evaluation.metrics import pose_errors
+from dougong.registration import register
+from dougong.registration.evidence import summon
+from dougong.registration.ground_relief import relief
+from dougong.registration.prepare import prepare
+from dougong.registration.standing_things import Telling, things_of
+
+SPOTS = [
+    (-9.0, -7.0),
+    (-3.0, 8.0),
+    (6.0, -9.0),
+    (9.0, 4.0),
+    (-11.0, 5.0),
+    (2.0, -4.0),
+    (11.0, -3.0),
+]
+SIZES = [(0.8, 0.8, 2.6), (1.5, 1.5, 1.0), (0.5, 1.2, 0.9), (2.0, 0.4, 0.8)]
+
+
+def box(rng, at, size):
+    """Points on the sides and the top of a box that stands on z = 0."""
+    points = rng.random((int(900 * size[2]) + 300, 3)) * size
+    face = rng.integers(0, 5, len(points))
+    axis = np.array([0, 0, 1, 1, 2])[face]
+    points[np.arange(len(points)), axis] = np.array([0, 1, 0, 1, 1])[face] * np.array(size)[axis]
+    return points + [at[0] - size[0] / 2, at[1] - size[1] / 2, 0.0]
+
+
+def court(spots, seed=0, sizes=SIZES, hole=None):
+    """A house on level ground with boxes about it, as a prepared cloud; no ground in `hole`."""
+    rng = np.random.default_rng(seed)
+    ground = np.column_stack([rng.uniform(-16, 16, (40_000, 2)), np.zeros(40_000)])
+    is_under = np.zeros(len(ground), bool)
+    parts = [box(rng, (0.0, 1.0), (7.0, 4.0, 4.0))]
+    for k, spot in enumerate(spots):
+        size = sizes[k % len(sizes)]
+        parts.append(box(rng, spot, size))
+        is_under |= (np.abs(ground[:, :2] - spot) < np.array(size[:2]) / 2).all(axis=1)
+    if hole is not None:
+        is_under |= np.linalg.norm(ground[:, :2] - hole, axis=1) < 3.0
+    points = np.vstack([ground[~is_under], *parts])
+    points += rng.normal(0.0, 0.004, points.shape)
+    cloud = Cloud.from_points(points)
+    found = prepare(cloud, "lidar")
+    return replace(found, xyz=found.xyz + cloud.frame.origin)
+
+
+def things_between(one, two):
+    heard = summon(one, two)
+    return things_of((one, heard.source.everything), (two, heard.target.everything), 0.2)
+
+
+def shifted(*by):
+    T = np.eye(4)
+    T[: len(by), 3] = by
+    return T
+
+
+def turned(degrees):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    T = np.eye(4)
+    T[:2, :2] = [[c, -s], [s, c]]
+    return T
+
+
+def test_things_are_found_where_they_stand_and_gone_elsewhere():
+    things = things_between(court(SPOTS), court(SPOTS, 1))
+    here, beside = things.fates(np.eye(4)), things.fates(turned(100.0))
+    assert len(here.is_found) == 2 * len(SPOTS)
+    assert here.is_found.all()
+    assert not here.is_gone.any()
+    assert beside.is_gone.sum() >= 10
+    assert beside.is_found.sum() <= 2
+    assert things.telling(np.eye(4), []).is_vouched
+    assert not things.telling(np.eye(4), []).is_refuted
+    assert things.telling(turned(100.0), []).is_refuted
+
+
+def test_a_place_without_ground_says_nothing_of_a_thing():
+    hidden = court(SPOTS[1:], 1, SIZES[1:] + SIZES[:1], hole=SPOTS[0])
+    fates = things_between(court(SPOTS), hidden).fates(np.eye(4))
+    assert not fates.is_gone.any()
+    bare = court(SPOTS[1:], 1, SIZES[1:] + SIZES[:1])
+    assert things_between(court(SPOTS), bare).fates(np.eye(4)).is_gone.sum() == 1
+
+
+def test_who_walked_away_is_no_witness():
+    people = [(0.4, 0.6, 1.7)]
+    things = things_between(court(SPOTS, sizes=people), court([]))
+    assert things.fates(np.eye(4)).is_gone.sum() == len(SPOTS)
+    assert things.telling(np.eye(4), []).gone == 0
+
+
+def test_what_a_rival_finds_too_repeats_and_is_not_asked():
+    spots = [(x, y) for a, b in SPOTS[:4] for x, y in ((a, b), (-a, -b))]
+    sizes = [size for size in SIZES for _ in range(2)]
+    things = things_between(court(spots, sizes=sizes), court(spots, 1, sizes=sizes))
+    assert things.telling(np.eye(4), []).found == 16
+    assert things.telling(np.eye(4), [turned(180.0)]).found < 3
+
+
+def test_things_that_stayed_speak_for_the_pose_that_finds_them():
+    things = things_between(court(SPOTS), court(SPOTS, 1))
+    assert things.speak_for(np.eye(4), turned(100.0)) >= 6
+    assert things.speak_for(turned(100.0), np.eye(4)) == 0
+
+
+@pytest.mark.parametrize(
+    ("found", "gone", "chance", "is_vouched", "is_refuted"),
+    [
+        (0, 0, 0.05, False, False),
+        (0, 2, 0.05, False, False),
+        (0, 3, 0.05, False, True),
+        (3, 0, 0.05, True, False),
+        (2, 0, 0.05, False, False),
+        (4, 30, 0.10, False, True),
+        (12, 30, 0.10, True, False),
+    ],
+)
+def test_telling_weighs_found_and_gone_by_chance(found, gone, chance, is_vouched, is_refuted):
+    telling = Telling(found=found, gone=gone, chance=chance)
+    assert (telling.is_vouched, telling.is_refuted) == (is_vouched, is_refuted)
+
+
+def rolling(seed, phase=0.0):
+    rng = np.random.default_rng(seed)
+    plan = rng.uniform(-20, 20, (30_000, 2))
+    x, y = plan.T
+    height = 0.10 * np.sin(0.31 * x + 0.2 * y + phase) + 0.07 * np.sin(
+        0.5 * y - 0.2 * x + 2 * phase
+    )
+    return np.column_stack([plan, 5.0 + 0.02 * x + height + rng.normal(0, 0.004, len(x))])
+
+
+def test_the_ground_vouches_for_its_own_place_only():
+    here = relief(rolling(0), rolling(1), np.eye(4))
+    assert here.is_vouched
+    assert here.alike > 0.99
+    turn = turned(180.0)
+    turn[2, 3] = 0.0
+    elsewhere = relief(rolling(0), rolling(1, phase=2.1), np.eye(4))
+    assert not elsewhere.is_vouched
+    assert relief(rolling(0), rolling(1), turn).alike < 0.9
+
+
+def test_level_paving_says_nothing():
+    rng = np.random.default_rng(2)
+    one, two = (
+        np.column_stack([rng.uniform(-20, 20, (20_000, 2)), rng.normal(0, 0.004, 20_000)])
+        for _ in range(2)
+    )
+    found = relief(one, two, np.eye(4))
+    assert np.isnan(found.alike)
+    assert not found.is_vouched
+    assert not found.is_refuted
+
+
+def test_relief_does_not_change_with_the_frame():
+    one, two, T = rolling(0), rolling(1), turned(37.0)
+    T[:3, 3] = 120.0, -60.0, 3.0
+    moved = (one - T[:3, 3]) @ T[:3, :3]
+    assert relief(moved, two, T).alike == pytest.approx(relief(one, two, np.eye(4)).alike, abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", sorted(COPIES))
+def test_a_place_is_made_again_by_its_seed(kind):
+    small = {"lidar_points": 3000, "photogrammetry_points": 3000}
+    one, two = (make_trial(kind, 5, is_copy=True, things=3, **small) for _ in range(2))
+    assert np.array_equal(one.source, two.source)
+    assert np.array_equal(one.target, two.target)
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed", "things", "said"),
+    [
+        ("corners", 2, 0, "both scans show one side"),
+        ("cloister", 0, 3, "the place repeats"),
+        ("stalls", 2, 2, "found under another one"),
+    ],
+)
+def test_a_copy_that_fits_best_is_not_ok(kind, seed, things, said):
+    trial = make_trial(kind, seed, is_copy=True, things=things)
+    source, target = (Cloud.from_points(points) for points in (trial.source, trial.target))
+    found = register(source, target, source_kind=trial.source_kind, target_kind=trial.target_kind)
+    assert found.status == "ambiguous"
+    assert said in found.reason
+    assert not pose_errors(found.matrix, trial.truth).is_correct
+
+
+def test_the_same_part_among_things_is_ok():
+    trial = make_trial("cloister", 1, is_copy=False, things=12)
+    source, target = (Cloud.from_points(points) for points in (trial.source, trial.target))
+    found = register(source, target, source_kind="lidar", target_kind="lidar")
+    assert found.status == "ok"
+    assert pose_errors(found.matrix, trial.truth).is_correct
+
+
+def test_another_relief_refutes_a_pose_and_a_bent_flight_does_not():
+    assert relief(rolling(0), rolling(1, phase=2.1), np.eye(4)).is_refuted
+    paving, bent = rolling(0) * (1, 1, 0.15), rolling(1, phase=2.1) * (1, 1, 0.3)
+    found = relief(paving, bent, np.eye(4))
+    assert found.alike < 0.3
+    assert not found.is_refuted
+
+
+def test_no_ground_says_nothing():
+    found = relief(np.zeros((0, 3)), rolling(0), np.eye(4))
+    assert not found.is_vouched
+    assert not found.is_refuted
