@@ -216,3 +216,34 @@ def test_no_ground_says_nothing():
     found = relief(np.zeros((0, 3)), rolling(0), np.eye(4))
     assert not found.is_vouched
     assert not found.is_refuted
+
+
+def on_rolling_ground(seed, amplitude):
+    """A box of a house, which equals itself turned by 180 degrees, on ground that does not."""
+    rng = np.random.default_rng(seed)
+    ground = rolling(seed) - [0.0, 0.0, 5.0]
+    ground[:, 2] -= 0.02 * ground[:, 0]
+    ground[:, 2] *= amplitude
+    is_under = (np.abs(ground[:, :2]) < [5.0, 3.0]).all(axis=1)
+    walls = box(rng, (0.0, 0.0), (10.0, 6.0, 5.0))
+    points = np.vstack([ground[~is_under], walls, box(rng, (0.0, 0.0), (10.0, 6.0, 5.0))])
+    return points + rng.normal(0.0, 0.004, points.shape)
+
+
+@pytest.mark.parametrize(("amplitude", "status"), [(0.35, "ok"), (0.0, "ambiguous")])
+def test_the_ground_tells_the_turns_of_a_house_apart(amplitude, status):
+    truth = turned(140.0)
+    truth[:3, 3] = 30.0, -20.0, 2.0
+    one, two = on_rolling_ground(0, amplitude), on_rolling_ground(1, amplitude)
+    found = register(
+        Cloud.from_points((one - truth[:3, 3]) @ truth[:3, :3]),
+        Cloud.from_points(two),
+        source_kind="lidar",
+        target_kind="lidar",
+    )
+    assert found.status == status
+    if status == "ok":
+        assert "relief of the ground" in found.reason
+        middle = np.linalg.inv(truth) @ [0.0, 0.0, 3.0, 1.0]
+        assert np.linalg.norm(found.matrix @ middle - [0.0, 0.0, 3.0, 1.0]) < 0.05
+        assert np.degrees(np.arccos((np.trace(found.matrix[:3, :3] @ truth[:3, :3].T) - 1) / 2)) < 1

@@ -24,6 +24,7 @@ from dougong.registration.rivals import is_same, middle_of
 from dougong.registration.roof_sides import height_left_open, weigh_height
 from dougong.registration.scale_check import size_doubt
 from dougong.registration.settings import Register
+from dougong.registration.told_by_ground import told_by_ground
 from dougong.registration.verdict import Ruling, rule, status_of
 from dougong.typing import Transform
 
@@ -73,6 +74,7 @@ def decide(
         params.verdict,
         lambda T: _is_near_hint(T, params) and (control is None or control.allows(T)),
     )
+    ruling = told_by_ground(court, (source, target), levels, ruling, quick, params.verdict)
     clock.lap("proof")
     fine, adjusted = _refined(source, target, ruling, params, control)
     T = ruling.winner.T if fine is None else fine.T_target_source

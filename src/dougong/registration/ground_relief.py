@@ -10,10 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dougong.registration.overlap import apply
+from dougong.registration.overlap import Rung, apply
+from dougong.registration.prepare import Prepared
 from dougong.typing import Index, Points, Transform, Values
 
 _CELL_M = 1.0
+_WIDTH = 1 << 24
+"""Cells along a row of the numbering: local frames are nowhere wider."""
+_MOST_POINTS = 60_000
 _LEAST_POINTS = 3
 """In each cell, of each cloud."""
 _LEAST_CELLS = 40
@@ -24,6 +28,8 @@ _UNBENT_M = 0.03
 _ALIKE, _UNLIKE = 0.9, 0.3
 """Generated sites under true poses: 0.93 and more. The feet of equal walls: up to 0.86."""
 _TURNS = 7
+_LEVEL = 0.95
+"""The rise of a normal from which on it is the ground's."""
 
 
 class Relief(NamedTuple):
@@ -47,14 +53,27 @@ class Relief(NamedTuple):
         return self.alike < _UNLIKE and self.spread_m >= _UNBENT_M
 
 
+def level_ground(cloud: Prepared, everything: Rung) -> Points:
+    """Return ground (n, 3) of a rung without the feet of walls that hang on it: walls repeat."""
+    rise = np.abs(cloud.normals[everything.index] @ cloud.up)
+    level = everything.xyz[cloud.is_ground[everything.index] & (rise > _LEVEL)]
+    few: Points = level[:: -(-len(level) // _MOST_POINTS) or 1]
+    return few
+
+
+def likeness(source: Points, target: Points, T: Transform) -> float:
+    """Return the correlation of the relief of two clouds' ground (n, 3) under a pose, or NaN."""
+    return _alike(apply(T, source), _heights(target))[0]
+
+
 def relief(source: Points, target: Points, T: Transform) -> Relief:
     """Compare the ground (n, 3) of two clouds under a pose (source -> target)."""
-    moved = apply(T, source)
-    alike, spread = _alike(moved, target)
+    moved, heights = apply(T, source), _heights(target)
+    alike, spread = _alike(moved, heights)
     if np.isnan(alike):
         return Relief(alike, np.nan, spread)
     middle = (moved.min(axis=0) + moved.max(axis=0)) / 2.0
-    turned = [_alike(_turned(moved, middle, k), target)[0] for k in range(1, _TURNS + 1)]
+    turned = [_alike(_turned(moved, middle, k), heights)[0] for k in range(1, _TURNS + 1)]
     known = [value for value in turned if np.isfinite(value)]
     return Relief(alike, max(known, default=0.0), spread)
 
@@ -65,20 +84,17 @@ def _turned(points: Points, middle: Values, eighth: int) -> Points:
     return turned
 
 
-def _alike(one: Points, two: Points) -> tuple[float, float]:
-    """Return the correlation of the relief of two grounds (n, 3) in one frame, and the smaller one.
+def _alike(one: Points, two: tuple[Index, Values]) -> tuple[float, float]:
+    """Return how the relief of ground (n, 3) and of known cells correlate, and the smaller one.
 
     NaN, where too few cells are shared or one shows no relief.
     """
-    if not len(one) or not len(two):
-        return np.nan, 0.0
-    low = np.minimum(one[:, :2].min(axis=0), two[:, :2].min(axis=0))
-    width = int(np.floor((np.maximum(one[:, 1].max(), two[:, 1].max()) - low[1]) / _CELL_M)) + 1
-    (cells, heights), (others, other_heights) = (_heights(p, low, width) for p in (one, two))
+    (cells, heights), (others, other_heights) = _heights(one), two
     shared, first, second = np.intersect1d(cells, others, assume_unique=True, return_indices=True)
     if len(shared) < _LEAST_CELLS:
         return np.nan, 0.0
-    plan = np.column_stack([shared // width, shared % width, np.ones(len(shared))])
+    place = np.column_stack([shared // _WIDTH, shared % _WIDTH]).astype(np.float64)
+    plan = np.column_stack([place - place.mean(axis=0), np.ones(len(shared))])
     left = [_without_plane(plan, h) for h in (heights[first], other_heights[second])]
     spread = [float(np.std(values)) for values in left]
     if min(spread) < _RELIEF_M:
@@ -86,13 +102,13 @@ def _alike(one: Points, two: Points) -> tuple[float, float]:
     return float(np.mean(left[0] * left[1]) / (spread[0] * spread[1])), min(spread)
 
 
-def _heights(points: Points, low: Values, width: int) -> tuple[Index, Values]:
+def _heights(points: Points) -> tuple[Index, Values]:
     """Return the cells, ascending, with enough points, and the lower quartile of their heights.
 
     What is taken for ground ends a hand's breadth up the walls, and walls repeat.
     """
-    i, j = np.floor((points[:, :2] - low) / _CELL_M).astype(np.int64).T
-    cell = i * width + j
+    i, j = np.floor(points[:, :2] / _CELL_M).astype(np.int64).T
+    cell = (i + _WIDTH // 2) * _WIDTH + j + _WIDTH // 2
     order = np.lexsort((points[:, 2], cell))
     cells, first, count = np.unique(cell[order], return_index=True, return_counts=True)
     height = points[order[first + count // 4], 2]

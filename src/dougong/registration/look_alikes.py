@@ -13,13 +13,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from dougong.registration.evidence import Court, Testimony, hear, sharpness, support, violation
-from dougong.registration.ground_relief import relief
+from dougong.registration.ground_relief import level_ground, relief
 from dougong.registration.prepare import Prepared
 from dougong.registration.rivals import is_near
 from dougong.registration.standing_things import things_of
 from dougong.registration.symmetry import in_short, move_between
 from dougong.registration.verdict import Ruling, Verdict
-from dougong.typing import Points, Transform
+from dougong.typing import Transform
 
 _DECIDES = "Control points, a yaw hint, or a cloud that shows more of the site would decide."
 _SECTORS = 12
@@ -28,8 +28,8 @@ _MAIN = 0.1
 """Share of the walls from which on a heading is asked about, ..."""
 _ROW_M = 2.5
 """... and within how much the middle eight tenths of its walls lie in one row."""
-_UPRIGHT, _LEVEL = 0.5, 0.95
-"""The rise of a normal up to which it is a wall's, and from which on it is the ground's."""
+_UPRIGHT = 0.5
+"""The rise of a normal up to which it is a wall's."""
 _SUPPORT, _SHARPNESS, _VIOLATION = 0.5, 0.4, 0.01
 """A beaten pose is possible where it explains this share of what lies near under it, this share as
 sharply as the winner, and violates this much more free space at most. Of ten cloisters the false
@@ -70,7 +70,11 @@ def look_alike_doubt(
             "chance finds. Either nearly all of it was moved, or the clouds show two parts of the "
             f"place that are alike. {_DECIDES}"
         )
-    ground = relief(_level_ground(source), _level_ground(target), winner)
+    ground = relief(
+        level_ground(source, court.source.everything),
+        level_ground(target, court.target.everything),
+        winner,
+    )
     if ground.is_refuted:
         return (
             "the ground speaks against the best pose: both clouds show its relief, and it is not "
@@ -127,13 +131,6 @@ def _is_one_side(court: Court, pose: Testimony) -> bool:
             if np.ptp(np.quantile(off, [0.1, 0.9])) > _ROW_M:
                 return False
     return True
-
-
-def _level_ground(cloud: Prepared) -> Points:
-    """Return the ground (n, 3) without the feet of walls that hang on it: walls repeat."""
-    is_level = np.abs(cloud.normals @ cloud.up) > _LEVEL
-    level: Points = cloud.xyz[cloud.is_ground & is_level]
-    return level
 
 
 def _moved(rival: Transform, ruling: Ruling) -> str:

@@ -118,6 +118,8 @@ class Ruling:
     overruled: Comparison | None = None
     """How the winner compares with a pose that is not allowed (by a hint, by control points) and
     that the clouds prefer beyond doubt; None: there is none."""
+    told: str = ""
+    """What told the winner from poses that fit as well; see `told_by_ground`."""
 
 
 def compare(
@@ -376,7 +378,7 @@ def status_of(ruling: Ruling, fine: FineResult | None, params: Verdict) -> tuple
             f"the shared surface does not hold the pose: it {texts}. Control points, or surface "
             "facing that way in both clouds, would decide."
         )
-    beaten = (
+    beaten = ruling.told or (
         f"the next pose contradicts {100 * ruling.beaten[0].gain:.1f} % more of the surface "
         f"(p = {max(ruling.beaten[0].p_value, 1e-9):.1g} over {ruling.beaten[0].blocks} blocks)"
         if ruling.beaten
