@@ -46,7 +46,8 @@ def hidden_shares(
             nearest[cell] = min(nearest[cell], distance)
         hidden = 0
         for i in range(n):
-            towards = 2 * rows if cells[i] < rows * rows else -2 * rows
+            is_below = 2 * (cells[i] // (2 * rows)) < rows
+            towards = 2 * rows if is_below else -2 * rows
             least = max(nearest[cells[i]], nearest[cells[i] + towards])
             hidden += ranges[i] > factor * least + extra
         out[k] = hidden / n

@@ -12,22 +12,28 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dougong.registration.evidence import Court, Testimony, hear, sharpness, support, violation
+from dougong.registration.evidence import (
+    Court,
+    Testimony,
+    Witness,
+    hear,
+    sharpness,
+    support,
+    violation,
+)
 from dougong.registration.ground_relief import level_ground, relief
 from dougong.registration.prepare import Prepared
 from dougong.registration.rivals import is_near
 from dougong.registration.standing_things import things_of
 from dougong.registration.symmetry import in_short, move_between
 from dougong.registration.verdict import Ruling, Verdict
-from dougong.typing import Transform
+from dougong.typing import Mask, Transform
 
 _DECIDES = "Control points, a yaw hint, or a cloud that shows more of the site would decide."
-_SECTORS = 12
-_SECTOR_DEG = 180.0 / _SECTORS
-_MAIN = 0.1
-"""Share of the walls from which on a heading is asked about, ..."""
-_ROW_M = 2.5
-"""... and within how much the middle eight tenths of its walls lie in one row."""
+_BEARINGS, _FEW = 36, 0.002
+_BEARING_DEG = 360.0 / _BEARINGS
+_HIDDEN_DEG = 100.0
+"""No ground in so wide an arc: 150 to 210 degrees before corners and fronts, all round 0 to 20."""
 _UPRIGHT = 0.5
 """The rise of a normal up to which it is a wall's."""
 _SUPPORT, _SHARPNESS, _VIOLATION = 0.5, 0.4, 0.01
@@ -101,8 +107,13 @@ def _unseen_copy(
                     "and nothing that stands about tells which: the pose that explains most may "
                     f"lay one part on another. {_DECIDES}"
                 )
-    is_one_side = _is_one_side(court, ruling.winner)
-    if is_one_side and source.has_ground and target.has_ground:
+    is_explained = np.split(ruling.winner.is_explained, [len(court.source.points)])
+    if all(
+        cloud.has_ground and _shows_one_side(cloud, witness, explained)
+        for cloud, witness, explained in zip(
+            (source, target), (court.source, court.target), is_explained, strict=True
+        )
+    ):
         return (
             "both scans show one side of what stands there, and neither the ground nor anything "
             "about it tells that it is the same side: an opposite side that is alike would fit as "
@@ -111,26 +122,23 @@ def _unseen_copy(
     return None
 
 
-def _is_one_side(court: Court, pose: Testimony) -> bool:
-    """Say whether the explained walls of each heading lie in one row, in either cloud.
+def _shows_one_side(cloud: Prepared, witness: Witness, is_explained: Mask) -> bool:
+    """Say whether ground is shown on one side only of the explained walls.
 
-    So they do at a corner of a house, along a straight front, and round half a tower; of a house
-    seen all round, of a room and of a street each heading has walls well before one another.
+    What stands there hides the ground behind it from a scan of a corner or of a front. Stations all
+    round, or within a room or a court, show ground in every bearing from the middle of the walls.
     """
-    split = len(court.source.points)
-    for cloud, part in ((court.source, slice(0, split)), (court.target, slice(split, None))):
-        is_wall = cloud.is_structure & (np.abs(cloud.normals[:, 2]) < _UPRIGHT)
-        is_wall &= pose.is_explained[part]
-        normals, places = cloud.normals[is_wall, :2], cloud.points[is_wall, :2]
-        heading = np.degrees(np.arctan2(normals[:, 1], normals[:, 0])) % 180.0
-        sector = np.round(heading / _SECTOR_DEG).astype(np.int64) % _SECTORS
-        held = np.bincount(sector, minlength=_SECTORS)
-        for k in np.flatnonzero(held > _MAIN * len(sector)):
-            turn = np.radians(k * _SECTOR_DEG)
-            off = places[sector == k] @ np.array([np.cos(turn), np.sin(turn)])
-            if np.ptp(np.quantile(off, [0.1, 0.9])) > _ROW_M:
-                return False
-    return True
+    is_wall = witness.is_structure & is_explained & (np.abs(witness.normals[:, 2]) < _UPRIGHT)
+    walls, ground = witness.points[is_wall, :2], level_ground(cloud, witness.everything)[:, :2]
+    if not len(walls) or not len(ground):
+        return False
+    low, high = np.quantile(walls, [0.02, 0.98], axis=0)
+    off = ground - (low + high) / 2.0
+    bearing = np.degrees(np.arctan2(off[:, 1], off[:, 0])) % 360.0
+    held = np.bincount((bearing / _BEARING_DEG).astype(np.int64) % _BEARINGS)
+    shown = np.flatnonzero(held > _FEW * len(ground))
+    empty = np.diff([*shown, shown[0] + _BEARINGS]) - 1
+    return bool(empty.max() * _BEARING_DEG >= _HIDDEN_DEG)
 
 
 def _moved(rival: Transform, ruling: Ruling) -> str:
