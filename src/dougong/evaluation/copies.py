@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dougong.evaluation import drone, scanner
 from dougong.evaluation.buildings.roofs import Slope, hipped
 from dougong.evaluation.hard_trials import Trial, inverse, moved, pose
-from dougong.evaluation.mesh import CLUTTER, GROUND, Mesh, Tracer, join
+from dougong.evaluation.mesh import CLUTTER, FINE, GROUND, SURFACE, Mesh, Tracer, join
 from dougong.evaluation.metrics import Truth
 from dougong.evaluation.site import foliage, trunks
 from dougong.evaluation.solids import beam, block, box, lathe
@@ -79,7 +79,7 @@ def make_trial(
             clouds.append(scanner.scan(tracer, stations, params, rng))
     T = pose(rng)
     source = moved(T, clouds[0].xyz)
-    still = np.isin(clouds[0].labels, (0, 1, GROUND))
+    still = np.isin(clouds[0].labels, (SURFACE, FINE, GROUND))
     surface = clouds[0].xyz[still][::20]
     truth = Truth(
         T_target_source=inverse(T),
@@ -330,9 +330,8 @@ def _thing(rng: np.random.Generator, most: float = 2.4) -> tuple[Mesh, float]:
     size = rng.uniform(0.3, 1.0, 3) * most
     kind = rng.choice(["crate", "drum", "wall", "tree", "post"])
     if kind == "crate":
-        return block((0, 0, -0.1), (size[0], size[1], size[2]), "timber").turned(
-            rng.uniform(0, 90)
-        ), 0.7 * size[:2].max()
+        crate = block((0, 0, -0.1), (size[0], size[1], size[2]), "timber")
+        return crate.turned(rng.uniform(0, 90)), 0.7 * size[:2].max()
     if kind == "drum":
         radius = size[0] / 2
         return lathe([(radius, -0.1), (radius * 1.1, size[2] / 2), (radius, size[2])], 14), radius

@@ -27,7 +27,7 @@ from dougong.registration.rivals import is_near
 from dougong.registration.standing_things import things_of
 from dougong.registration.symmetry import in_short, move_between
 from dougong.registration.verdict import Ruling, Verdict
-from dougong.typing import Mask, Transform
+from dougong.typing import Mask, Points, Transform
 
 _DECIDES = "Control points, a yaw hint, or a cloud that shows more of the site would decide."
 _BEARINGS, _FEW = 36, 0.002
@@ -76,11 +76,11 @@ def look_alike_doubt(
             "chance finds. Either nearly all of it was moved, or the clouds show two parts of the "
             f"place that are alike. {_DECIDES}"
         )
-    ground = relief(
+    grounds = (
         level_ground(source, court.source.everything),
         level_ground(target, court.target.everything),
-        winner,
     )
+    ground = relief(*grounds, winner)
     if ground.is_refuted:
         return (
             "the ground speaks against the best pose: both clouds show its relief, and it is not "
@@ -89,16 +89,15 @@ def look_alike_doubt(
         )
     if telling.is_vouched or ground.is_vouched:
         return None
-    return _unseen_copy(court, source, target, ruling, rivals)
+    is_scanned = source.kind == target.kind == "lidar"
+    # A flight shows a building from all sides.
+    return _unseen_copy(court, grounds, ruling, rivals) if is_scanned else None
 
 
 def _unseen_copy(
-    court: Court, source: Prepared, target: Prepared, ruling: Ruling, rivals: Sequence[Transform]
+    court: Court, grounds: tuple[Points, Points], ruling: Ruling, rivals: Sequence[Transform]
 ) -> str | None:
     """Return where two scans that nothing else ties to one place leave room for a copy of it."""
-    if source.kind != "lidar" or target.kind != "lidar":
-        # A flight shows a building from all sides.
-        return None
     if court.source.free is not None and court.target.free is not None:
         for rival in rivals:
             if _is_possible(court, hear(court, rival), ruling):
@@ -109,9 +108,9 @@ def _unseen_copy(
                 )
     is_explained = np.split(ruling.winner.is_explained, [len(court.source.points)])
     if all(
-        cloud.has_ground and _shows_one_side(cloud, witness, explained)
-        for cloud, witness, explained in zip(
-            (source, target), (court.source, court.target), is_explained, strict=True
+        _shows_one_side(ground, witness, explained)
+        for ground, witness, explained in zip(
+            grounds, (court.source, court.target), is_explained, strict=True
         )
     ):
         return (
@@ -122,18 +121,18 @@ def _unseen_copy(
     return None
 
 
-def _shows_one_side(cloud: Prepared, witness: Witness, is_explained: Mask) -> bool:
-    """Say whether ground is shown on one side only of the explained walls.
+def _shows_one_side(ground: Points, witness: Witness, is_explained: Mask) -> bool:
+    """Say whether ground (n, 3) is shown on one side only of the explained walls.
 
     What stands there hides the ground behind it from a scan of a corner or of a front. Stations all
     round, or within a room or a court, show ground in every bearing from the middle of the walls.
     """
     is_wall = witness.is_structure & is_explained & (np.abs(witness.normals[:, 2]) < _UPRIGHT)
-    walls, ground = witness.points[is_wall, :2], level_ground(cloud, witness.everything)[:, :2]
+    walls = witness.points[is_wall, :2]
     if not len(walls) or not len(ground):
         return False
     low, high = np.quantile(walls, [0.02, 0.98], axis=0)
-    off = ground - (low + high) / 2.0
+    off = ground[:, :2] - (low + high) / 2.0
     bearing = np.degrees(np.arctan2(off[:, 1], off[:, 0])) % 360.0
     held = np.bincount((bearing / _BEARING_DEG).astype(np.int64) % _BEARINGS)
     shown = np.flatnonzero(held > _FEW * len(ground))

@@ -12,7 +12,7 @@ not asked.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from scipy.stats import binom
 from dougong.filters.clusters import clusters_of, members
 from dougong.filters.clutter_shapes import Shape, shape_of
 from dougong.filters.neighbourhood import Neighbourhood, build_index, nearest
+from dougong.kernels.raster import cell_min
 from dougong.registration.overlap import Rung, apply, inverse
 from dougong.registration.prepare import Prepared
 from dougong.typing import Index, Mask, Points, Transform, Values
@@ -137,9 +138,17 @@ class Things:
     target: _Side
     near_m: float
     """Two views of one surface lie no farther apart than this."""
+    _known: dict[bytes, Fates] = field(default_factory=dict)
+    """By pose: the winner is held against every rival, and each rival is asked twice."""
 
     def fates(self, T: Transform) -> Fates:
         """Return what a pose (source -> target) says of every thing."""
+        key = T.tobytes()
+        if key not in self._known:
+            self._known[key] = self._fates(T)
+        return self._known[key]
+
+    def _fates(self, T: Transform) -> Fates:
         one = _fates(self.source, self.target, T, self.near_m)
         two = _fates(self.target, self.source, inverse(T), self.near_m)
         found, gone = zip(one, two, strict=True)
@@ -242,10 +251,11 @@ def _floor(ground: Points, spacing_m: float) -> _Floor:
     low = ground[:, :2].min(axis=0)
     widest = float((ground[:, :2].max(axis=0) - low).max())
     cell = max(_CELL_M, 2.0 * spacing_m, widest / _MOST_CELLS)
-    i, j = np.floor((ground[:, :2] - low) / cell).astype(np.int64).T
-    height = np.full((int(i.max()) + 1, int(j.max()) + 1), np.inf)
-    np.minimum.at(height, (i, j), ground[:, 2])
-    return _Floor(low, cell, np.where(np.isfinite(height), height, np.nan))
+    i, j = np.ascontiguousarray(np.floor((ground[:, :2] - low) / cell).astype(np.int64).T)
+    shape = int(i.max()) + 1, int(j.max()) + 1
+    height = np.full(shape, np.nan)
+    cell_min(j, i, np.ascontiguousarray(ground[:, 2]), shape, height)
+    return _Floor(low, cell, height)
 
 
 def _fates(from_: _Side, to: _Side, T: Transform, near_m: float) -> tuple[Mask, Mask]:

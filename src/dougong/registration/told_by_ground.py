@@ -6,7 +6,6 @@ ground agrees with any pose. But where it rises and falls, it does so once.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +27,7 @@ _CHANCE = 1e-3
 def told_by_ground(
     court: Court,
     clouds: tuple[Prepared, Prepared],
-    levels: Sequence[Level],
+    levels: tuple[Level, ...],
     ruling: Ruling,
     icp: Icp,
     params: Verdict,
@@ -51,21 +50,19 @@ def told_by_ground(
     if np.isnan(alike).any():
         return ruling
     best = int(np.argmax(alike))
-    near = [is_near(T, poses[best], at) for T in poses]
-    if alike[~np.array(near)].max(initial=-1.0) >= _OTHERS:
-        return ruling
-    if not relief(*ground, poses[best]).is_vouched:
+    elsewhere = np.array([not is_near(T, poses[best], at) for T in poses])
+    most = float(alike[elsewhere].max(initial=-1.0))
+    if most >= _OTHERS or not relief(*ground, poses[best]).is_vouched:
         return ruling
     refuted = [
-        Comparison(T=T, gain=0.0, p_value=_CHANCE, blocks=0)
-        for T, is_it in zip(poses, near, strict=True)
-        if not is_it
+        Comparison(T=poses[k], gain=0.0, p_value=_CHANCE, blocks=0)
+        for k in np.flatnonzero(elsewhere)
     ]
-    told = _about(court, tuple(levels), poses[best], ruling, icp, params)
+    told = _about(court, levels, poses[best], ruling, icp, params)
     said = (
         f"{len(refuted)} other poses fit the walls as well, and the relief of the ground tells "
         f"them apart (correlation {alike[best]:.2f}, under the others at most "
-        f"{alike[~np.array(near)].max():.2f})"
+        f"{most:.2f})"
     )
     return replace(told, beaten=(*told.beaten, *refuted), told=said)
 
