@@ -189,6 +189,49 @@ def test_degrees_and_earth_centred_clouds_are_refused_with_advice(crs, said, tmp
         assert not out.exists()
 
 
+def applied(folder, crs, source, capsys):
+    """Transform a cloud in `crs` by the matrix of a source with the frame `source`."""
+    matrix, path = folder / "m.json", folder / "site.laz"
+    document = {"status": "ok", "source": "scan", "matrix": np.eye(4).tolist()}
+    matrix.write_text(json.dumps(document | source))
+    points = np.random.default_rng(0).uniform([116, 39, 0], [116.01, 39.01, 50], (500, 3))
+    dougong.write(Cloud.from_points(points, crs=crs), path, overwrite=True)
+    moved = folder / "moved.laz"
+    tokens = ["transform", path, moved, "--matrix", matrix, "--overwrite"]
+    code = call([*map(str, tokens), "--quiet", "--json"])
+    answer = json.loads(capsys.readouterr().out)
+    assert moved.exists() == (code == 0)
+    return answer["error"]["message"] if code else answer["notes"]
+
+
+FEET = {"crs_wkt": "EPSG:2263", "unit_m": [1200 / 3937] * 3}
+
+
+@pytest.mark.parametrize(
+    ("crs", "source", "said"),
+    [
+        ("EPSG:4326", {}, "is in degrees"),
+        ("EPSG:4978", {}, "earth-centred"),
+        ("EPSG:2263", {}, r"in units of 0.30480061 m \(NAD83 .*of scan, in metres. Convert"),
+        ("EPSG:2263", {"source_frame": {"crs_wkt": None, "unit_m": [1, 1, 1]}}, "in metres"),
+        ("EPSG:32650", {"source_frame": FEET}, "is in metres .*in units of 0.30480061 m"),
+    ],
+)
+def test_a_matrix_is_not_applied_to_other_units(crs, source, said, tmp_path, capsys):
+    assert re.search(said, applied(tmp_path, crs, source, capsys))
+
+
+def test_a_matrix_is_applied_to_the_units_it_is_for(tmp_path, capsys):
+    assert "in scan's" not in str(applied(tmp_path, "EPSG:2263", {"source_frame": FEET}, capsys))
+    assert "names no coordinate system: its numbers are taken for those of scan, in units" in str(
+        applied(tmp_path, None, {"source_frame": FEET}, capsys)
+    )
+    searched = {"source_frame": FEET, "scale_search": {"side": "source"}}
+    applied(tmp_path, "EPSG:32650", searched, capsys)
+    elsewhere = {"source_frame": {"crs_wkt": "EPSG:32649", "unit_m": [1, 1, 1]}}
+    assert "mean the same places" in str(applied(tmp_path, "EPSG:32650", elsewhere, capsys))
+
+
 def test_check_of_a_broken_file_exits_1(tmp_path, capsys):
     path = tmp_path / "broken.laz"
     path.write_bytes(b"")

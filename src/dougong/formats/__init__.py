@@ -20,8 +20,8 @@ from dougong.formats.registry import (
     write,
     write_stations,
 )
-from dougong.formats.reissue import can_reissue, reissue, scans_in
-from dougong.formats.units import in_system, is_same_crs, require_metric, units_of
+from dougong.formats.reissue import can_reissue, reissue, scans_in, system_in
+from dougong.formats.units import in_system, is_same_crs, metric_problem, require_metric, units_of
 
 __all__ = [
     "SUFFIXES",
@@ -39,12 +39,14 @@ __all__ = [
     "in_system",
     "is_same_crs",
     "iterate",
+    "metric_problem",
     "part_of",
     "read",
     "read_stations",
     "reissue",
     "require_metric",
     "scans_in",
+    "system_in",
     "units_of",
     "write",
     "write_merged",

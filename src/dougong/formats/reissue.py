@@ -12,7 +12,7 @@ from dougong.errors import InputError
 from dougong.formats.model import Written
 from dougong.formats.registry import iterate, kind_of, scans_of
 from dougong.formats.stream import iterate_scans, survey_of
-from dougong.formats.units import metre_form
+from dougong.formats.units import METRES, metre_form, units_of
 from dougong.typing import Transform
 
 CHUNK_POINTS = 1_000_000
@@ -48,6 +48,22 @@ def scans_in(path: Path | str) -> tuple[int, str | None]:
         return 1, las.crs_of(las.read_las_header(path))
     scans = scans_of(path, kind)
     return getattr(scans[-1].header, "station", 0) + 1, scans[0].crs
+
+
+def system_in(path: Path | str) -> tuple[str | None, tuple[float, float, float] | None]:
+    """Return a file's reference system, WKT, and its metres per unit; None: it does not say.
+
+    E57 and PTX are metres by definition. No point is read.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read.
+    """
+    crs = scans_in(path)[1]
+    if kind_of(Path(path)) in ("e57", "ptx"):
+        return (None if crs is None else metre_form(crs)), METRES
+    return crs, None if crs is None else units_of(crs).unit_m
 
 
 def reissue(

@@ -4,19 +4,27 @@ from pathlib import Path
 from typing import Any
 
 from dougong.cloud import Frame
+from dougong.errors import FrameError
 from dougong.formats import (
     can_reissue,
+    describe,
     is_same_crs,
+    metric_problem,
     read,
     reissue,
     scans_in,
+    system_in,
+    units_of,
     write,
 )
+from dougong.formats.units import METRES
 from dougong.pipeline.memory import refuse_too_large
 from dougong.pipeline.outputs import refuse_output, watched
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import stem
-from dougong.pipeline.registrations import finite, read_registration
+from dougong.pipeline.registrations import Known, finite, read_registration
+
+Unit = tuple[float, float, float]
 
 
 def transform_file(
@@ -37,11 +45,15 @@ def transform_file(
         The registration is not sure and `accept_best` is False, or the output exists.
     RegistrationError
         The registration failed: there is no pose.
+    FrameError
+        The file is in degrees or earth-centred coordinates, or in other units than the matrix.
     """
     known = read_registration(matrix, accept_best=accept_best)
     refuse_output(input, output, [output], overwrite)
-    notes = []
-    if known.target_crs is not None and is_same_crs(scans_in(input)[1], known.target_crs):
+    crs, unit_m = system_in(input)
+    _require_unit(input, crs, unit_m, known)
+    notes = _system_notes(input, crs, unit_m, known)
+    if known.target_crs is not None and is_same_crs(crs, known.target_crs):
         notes.append(
             f"{input.name} is in {known.target}'s coordinate system already; check that it is "
             "not moved twice"
@@ -82,3 +94,51 @@ def transform_file(
         }
     )
     return document
+
+
+def _require_unit(input: Path, crs: str | None, unit_m: Unit | None, known: Known) -> None:
+    """Refuse a file in other units than the coordinates that the matrix takes.
+
+    Raises
+    ------
+    FrameError
+        As `transform_file`.
+    """
+    units = units_of(crs)
+    if units.is_geographic or units.is_geocentric:
+        info, nowhere = describe(input), (0.0, 0.0, 0.0)
+        low, high = info.extent_min or nowhere, info.extent_max or nowhere
+        raise FrameError(metric_problem(crs, low, high, input.name))
+    if unit_m is None or known.source_unit_m is None or unit_m == known.source_unit_m:
+        return
+    own = _unit_name(unit_m) + (f" ({units.name})" if units.name else "")
+    source = known.source or "its source"
+    msg = (
+        f"{input.name} is in {own}, and the matrix takes the coordinates of {source}, in "
+        f"{_unit_name(known.source_unit_m)}. Convert {input.name} to those, or register it itself."
+    )
+    raise FrameError(msg)
+
+
+def _unit_name(unit_m: Unit) -> str:
+    """Return metres per unit of plan and heights in words."""
+    plan, height = (
+        "metres" if value == 1.0 else f"units of {value:.9g} m" for value in (unit_m[0], unit_m[2])
+    )
+    return plan if plan == height else f"{plan} with heights in {height}"
+
+
+def _system_notes(input: Path, crs: str | None, unit_m: Unit | None, known: Known) -> list[str]:
+    """Return what is to be said of a file that is in another system, or names none."""
+    if crs is not None and known.source_crs is not None and not is_same_crs(crs, known.source_crs):
+        names = [units_of(one).name or "an unnamed system" for one in (crs, known.source_crs)]
+        return [
+            f"{input.name} is in {names[0]}, and the matrix takes coordinates in {names[1]}: that "
+            "is right only if the numbers of both mean the same places"
+        ]
+    if unit_m is None and known.source_unit_m not in (None, METRES):
+        return [
+            f"{input.name} names no coordinate system: its numbers are taken for those of "
+            f"{known.source}, in {_unit_name(known.source_unit_m)}"
+        ]
+    return []

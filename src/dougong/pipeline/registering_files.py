@@ -145,6 +145,7 @@ def _document(
         result,
         source=source.cloud.name,
         target=target.cloud.name,
+        source_frame=source.cloud.frame,
         target_frame=target.cloud.frame,
         inputs=[source.record, target.record],
     )

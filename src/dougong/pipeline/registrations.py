@@ -40,6 +40,7 @@ def to_document(
     *,
     source: str,
     target: str,
+    source_frame: Frame,
     target_frame: Frame,
     inputs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
@@ -50,16 +51,18 @@ def to_document(
     result : Registration
     source, target : str
         Names of the clouds.
-    target_frame : Frame
-        Of the target: turns local coordinates into the target file's.
+    source_frame, target_frame : Frame
+        What the coordinates of both files are in; the target's turns local ones into its file's.
     inputs : sequence of mapping
         ``{"path", "sha256", "points"}`` of every file read.
     """
     document = registration_to_json(
         result, source=source, target=target, target_frame=target_frame, inputs=inputs
     )
-    # What `dougong transform` needs to write the moved cloud as the target's file would be.
+    # What `dougong transform` needs to tell which clouds the matrix is for, and to write a moved
+    # one as the target's file would be.
     document["matrix_inverse"] = None if result.matrix is None else inverse(result.matrix)
+    document["source_frame"] = {"crs_wkt": source_frame.crs, "unit_m": source_frame.unit_m}
     document["target_frame"] = {"crs_wkt": target_frame.crs, "unit_m": target_frame.unit_m}
     cleaned: dict[str, Any] = finite(document)
     return cleaned
@@ -74,6 +77,9 @@ class Known:
     source: str
     target: str
     reason: str
+    source_crs: str | None
+    source_unit_m: tuple[float, float, float] | None
+    """Metres per unit of the coordinates that the matrix takes; None: searched, no file says it."""
     target_crs: str | None
     target_unit_m: tuple[float, float, float]
 
@@ -103,13 +109,16 @@ def read_registration(path: Path, *, accept_best: bool) -> Known:
             "Nothing was moved. Pass --accept-best to apply the best pose all the same."
         )
         raise InputError(msg)
-    frame = document.get("target_frame") or {}
+    source, frame = document.get("source_frame") or {}, document.get("target_frame") or {}
+    is_searched = (document.get("scale_search") or {}).get("side") == "source"
     return Known(
         status=status,
         matrix=_matrix_of(document["matrix"], path),
         source=str(document.get("source", "")),
         target=str(document.get("target", "")),
         reason=str(document.get("reason", "")),
+        source_crs=source.get("crs_wkt"),
+        source_unit_m=None if is_searched else tuple(source.get("unit_m", (1.0, 1.0, 1.0))),
         target_crs=frame.get("crs_wkt"),
         target_unit_m=tuple(frame.get("unit_m", (1.0, 1.0, 1.0))),
     )

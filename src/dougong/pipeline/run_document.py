@@ -26,6 +26,7 @@ def registration_documents(
             link.result,
             source=link.mover.name,
             target=reference.name,
+            source_frame=link.mover.frame,
             target_frame=reference.frame,
             inputs=[
                 loader.inputs[source.file] for source in (*link.mover.sources, *reference.sources)
