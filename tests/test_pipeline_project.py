@@ -21,6 +21,7 @@ from dougong.pipeline.project import (
     read_project,
     refuse_own_result,
 )
+from e57_surveys import survey
 
 DOCS = Path(__file__).parents[1] / "docs" / "commands.md"
 GOOD = """
@@ -164,6 +165,22 @@ def test_two_clouds_of_one_stem_are_refused():
             from_files([Path("a.laz")], [Path(other)])
     with pytest.raises(InputError, match="no cloud is named"):
         from_files([], [])
+
+
+@pytest.mark.parametrize("name", ["x-1", "x-03"])
+def test_a_cloud_called_as_a_station_of_another_is_refused_before_the_work(name, tmp_path):
+    survey(tmp_path / "x.e57", scans=3, rows=4, columns=4)
+    write(Cloud.from_points(np.eye(3)), tmp_path / "y.laz")
+    stations = Entry(name="x", kind="lidar", files=("x.e57",), registered=False)
+    other = Entry(name=name, kind="lidar", files=("y.laz",))
+    with pytest.raises(InputError, match=rf"cloud '{name}' is called as station .* of cloud 'x'"):
+        all_files(Project(cloud=(stations, other)), tmp_path)
+    for entries in (
+        (stations.model_copy(update={"registered": True}), other),
+        (stations, other.model_copy(update={"name": "x-4"})),
+        (stations, other.model_copy(update={"name": "x-one"})),
+    ):
+        assert len(all_files(Project(cloud=entries), tmp_path)) == 2
 
 
 def info(format_name="LAZ", attributes=(), low=(0.0, 0.0, 0.0), crs=None, stations=1):

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from dougong.errors import InputError
-from dougong.formats import SUFFIXES
+from dougong.formats import SUFFIXES, scans_in
 from dougong.formats.registry import kind_of
 from dougong.params import Parameters
 from dougong.pipeline.merging import Merge
@@ -242,7 +242,7 @@ def all_files(project: Project, folder: Path) -> list[Path]:
     ------
     InputError
         A path or pattern finds no file, or one file is there twice: its points would be too, and
-        would register onto themselves without an error.
+        would register onto themselves without an error; or a cloud is called as a station is.
     FormatError
         One of them is no point cloud.
     """
@@ -250,7 +250,26 @@ def all_files(project: Project, folder: Path) -> list[Path]:
     for file in (file for entry in project.cloud for file in files_of(entry, folder)):
         _refuse_twice(file, known)
         kind_of(file)
+    for entry in project.cloud:
+        _refuse_station_names(entry, project, folder)
     return list(known.values())
+
+
+def _refuse_station_names(entry: Entry, project: Project, folder: Path) -> None:
+    """Raise InputError where another cloud is called as a station of `entry` will be."""
+    names = [other.name for other in project.cloud if other.name.startswith(f"{entry.name}-")]
+    ends = {name: name.removeprefix(f"{entry.name}-") for name in names}
+    alike = {name: int(end) for name, end in ends.items() if end.isdecimal()}
+    if entry.registered or not alike:
+        return
+    count = sum(scans_in(file)[0] for file in files_of(entry, folder))
+    for name, number in alike.items():
+        if count > 1 and 1 <= number <= count:
+            msg = (
+                f"cloud {name!r} is called as station {number} of cloud {entry.name!r}, whose "
+                f"{count} stations move by themselves. Rename one of both clouds."
+            )
+            raise InputError(msg)
 
 
 def _refuse_twice(file: Path, known: dict[Path, Path]) -> None:
