@@ -9,8 +9,8 @@ import pytest
 
 from dougong.cloud import Cloud
 from dougong.errors import FormatError, InputError
-from dougong.formats import FileInfo, write
-from dougong.pipeline.guess import Guess, find_clouds, guess_kind, project_text
+from dougong.formats import FileInfo, describe, write
+from dougong.pipeline.guess import Guess, find_clouds, guess_kind, guess_kind_of, project_text
 from dougong.pipeline.outputs import write_text
 from dougong.pipeline.project import (
     Entry,
@@ -206,6 +206,23 @@ def test_sensors_are_guessed_from_what_files_hold(found, kind):
     guessed, why = guess_kind(found)
     assert guessed == kind
     assert why
+
+
+@pytest.mark.parametrize("name", ["a.laz", "a.ply", "a.pts"])
+@pytest.mark.parametrize(("last", "kind"), [(0, "photogrammetry"), (7, "lidar")])
+def test_one_intensity_throughout_is_no_sign_of_a_scanner(name, last, kind, tmp_path):
+    path, points = tmp_path / name, np.random.default_rng(0).uniform(0, 9, (300, 3))
+    values = np.zeros(300, dtype="u2")
+    values[-1] = last
+    if name.endswith(".pts"):
+        rows = (f"{x} {y} {z} {i} 9 8 7" for (x, y, z), i in zip(points, values, strict=True))
+        path.write_text("300\n" + "\n".join(rows) + "\n")
+    else:
+        colours = dict.fromkeys(("red", "green", "blue"), np.full(300, 9, dtype="u2"))
+        write(Cloud.from_points(points, intensity=values, **colours), path)
+    guessed, why = guess_kind_of(path, describe(path))
+    assert guessed == kind
+    assert ("one intensity throughout" in why) == (last == 0)
 
 
 def test_earlier_results_and_hidden_files_are_no_clouds_of_a_survey(tmp_path):

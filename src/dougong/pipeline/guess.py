@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dougong.errors import DougongError, InputError
-from dougong.formats import SUFFIXES, FileInfo, describe
+from dougong.formats import SUFFIXES, FileInfo, describe, iterate
 from dougong.pipeline.project import is_text, stem
 from dougong.typing import Kind
 
 _COLOURS = {"red", "green", "blue"}
 # A scanner's own frame starts at the first station; a map's easting and northing do not.
 _MAP_COORDINATE_M = 20_000.0
+_CHUNK_POINTS = 200_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,8 +28,45 @@ class Guess:
     points: int
 
 
-def guess_kind(info: FileInfo) -> tuple[Kind, str]:
-    """Return the sensor that a file's contents speak for, and why in words."""
+def guess_kind_of(file: Path, info: FileInfo) -> tuple[Kind, str]:
+    """Return the sensor that the contents of a described file speak for, and why in words.
+
+    Points are read only where the intensity decides, and only until two of them differ in it.
+
+    Raises
+    ------
+    FormatError
+        The file is damaged.
+    """
+    kind, why = guess_kind(info)
+    without = guess_kind(info, has_intensity=False)
+    if without[0] == kind or _intensity_differs(file):
+        return kind, why
+    return without
+
+
+def _intensity_differs(file: Path) -> bool:
+    """Say whether two points of a file differ in intensity.
+
+    Programs that make clouds of pictures write the field of their format and leave it 0.
+    """
+    first = None
+    for chunk in iterate(file, _CHUNK_POINTS):
+        name = next(name for name in chunk.attributes if name.lower() == "intensity")
+        values = chunk.attribute(name)
+        if values is None or not len(values):
+            continue
+        first = values[0] if first is None else first
+        if (values != first).any():
+            return True
+    return False
+
+
+def guess_kind(info: FileInfo, *, has_intensity: bool = True) -> tuple[Kind, str]:
+    """Return the sensor that a file's attributes speak for, and why in words.
+
+    `has_intensity` False: where the file has one, it is the same at every point and says nothing.
+    """
     names = {name.lower() for name in info.attributes}
     has_colour = names >= _COLOURS
     low = info.extent_min or (0.0, 0.0, 0.0)
@@ -42,6 +80,8 @@ def guess_kind(info: FileInfo) -> tuple[Kind, str]:
         return "photogrammetry", "colour and map coordinates"
     if has_colour and "intensity" not in names:
         return "photogrammetry", "colour and no intensity"
+    if has_colour and not has_intensity:
+        return "photogrammetry", "colour, and one intensity throughout"
     if not has_colour:
         return "lidar", "no colour"
     return "lidar", "colour and intensity in the scanner's own coordinates"
@@ -78,10 +118,10 @@ def find_clouds(folder: Path) -> tuple[list[Guess], list[str]]:
             continue
         try:
             info = describe(file)
+            kind, why = guess_kind_of(file, info)
         except DougongError as error:
             skipped.append(f"{inside}: {error}")
             continue
-        kind, why = guess_kind(info)
         name = _free_name(stem(file).replace("\\", "-"), (guess.name for guess in guesses))
         guesses.append(
             Guess(

@@ -17,7 +17,7 @@ from dougong.formats.faults import NO_SYSTEM
 from dougong.pipeline.control import read_control, require_control_of
 from dougong.pipeline.distances import Measured, distances_document, measure, write_distances
 from dougong.pipeline.exports import Ends, write_registration
-from dougong.pipeline.guess import guess_kind
+from dougong.pipeline.guess import guess_kind_of
 from dougong.pipeline.memory import refuse_too_large
 from dougong.pipeline.pairs import read_pairs
 from dougong.pipeline.progress import Progress
@@ -115,7 +115,7 @@ def _read(path: Path, kind: Kind | None, system: str | None, progress: Progress)
     cloud = in_system(read(path), system)
     guessed = []
     if kind is None:
-        kind, why = guess_kind(describe(path))
+        kind, why = guess_kind_of(path, describe(path))
         guessed = [f"{path.name} is taken for {kind} ({why})"]
     noticed = [f"{path.name}: {note}" for note in (*cloud.notes, *faults_of(cloud))]
     return _Input(
