@@ -137,6 +137,22 @@ def test_truncated_ply(tmp_path, text):
         read(path)
 
 
+@pytest.mark.parametrize(("text", "faces"), [(True, 0), (True, 20), (False, 0)])
+def test_more_than_a_ply_header_declares_is_said(tmp_path, text, faces):
+    path = save(tmp_path / "a.ply", vertices(), text=text, faces=faces)
+    whole = path.read_bytes()
+    path.write_bytes(whole + b"\r\n")
+    assert not [note for note in read(path).notes if "wrongly" in note]
+    path.write_bytes(whole.replace(b"element vertex 500", b"element vertex 450"))
+    size = np.dtype(DTYPE).itemsize
+    said = "50 lines" if text else f"{50 * size:,} bytes (of {size} a point)"
+    assert len(read(path)) == sum(map(len, iterate(path))) == 450
+    for cloud in (read(path), *iterate(path)):
+        (note,) = [note for note in cloud.notes if "wrongly" in note]
+        assert note.startswith(f"its header declares 450 points, wrongly: {said} follow")
+    assert note in describe(path).notes
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

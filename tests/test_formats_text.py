@@ -106,6 +106,27 @@ def test_the_fourth_of_seven_pts_columns_is_the_intensity(tmp_path, first):
 
 
 @pytest.mark.parametrize(
+    ("counts", "said"),
+    [
+        ((30,), ""),
+        ((20, 10), ""),
+        ((25,), "its count line says 25 points, wrongly: 30 rows follow, and all are read."),
+        ((20, 5), "its count lines say 25 points, wrongly: 30 rows follow, and all are read."),
+    ],
+)
+def test_more_rows_than_a_pts_file_counts_are_said(tmp_path, counts, said):
+    rows = [f"{k} {k % 7} {k % 3} 5" for k in range(30)]
+    for count in counts[1:]:
+        rows.insert(20, str(count))
+    path = save(tmp_path, "\n".join([str(counts[0]), *rows]) + "\n", "a.pts")
+    for cloud in (read(path), *iterate(path)):
+        assert len(cloud) == 30
+        assert ([note for note in cloud.notes if "wrongly" in note] or [""]) == [said]
+    found = [one.severity for one in check(path) if "wrongly" in one.text]
+    assert found == (["warning"] if said else [])
+
+
+@pytest.mark.parametrize(
     ("lines", "names"),
     [
         (["id,easting,northing,height,name"], ["id", "x", "y", "z"]),
@@ -283,6 +304,7 @@ def test_local_coordinates_do_not_depend_on_the_order_of_points(tmp_path):
             "after one line comes '1.000,50;1.200,10;3.000,00'",
         ),
         (b"5\n1 2 3\n4 5 6\n", "count line says 5 points, file ends after 2"),
+        (b"1\n1 2 3\n2\n4 5 6\n", "count lines say 3 points, file ends after 2"),
     ],
 )
 def test_what_cannot_be_read_gives_one_sentence(tmp_path, text, words):

@@ -30,6 +30,8 @@ _AXES = (("x", "y", "z"), ("X", "Y", "Z"))
 Element = tuple[str, int, list[list[str]]]
 """Name, count, the words of each property line."""
 CRS_COMMENT = "crs "
+_LINE_END = 2
+"""Bytes that a text tool may leave behind the points."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,8 @@ class PlyScan:
     notes: tuple[str, ...] = ()
     bits: dict[str, BitField] = field(default_factory=dict)
     loaded: Records | None = None
+    behind: int | None = None
+    """Bytes (of ASCII: lines) of the elements behind the vertices; None: not known."""
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -69,6 +73,31 @@ class PlyScan:
         for records in self._records(rows):
             coordinates = np.stack([records[a].astype(np.float64) for a in self.axes], axis=1)
             yield Block(records, coordinates)
+        note = self._surplus()
+        if note is not None and note not in self.notes:
+            self.notes = (*self.notes, note)
+
+    def _surplus(self) -> str | None:
+        """Return in words what follows all that the header declares; None: nothing, not known."""
+        if self.behind is None:
+            return None
+        with opened(self.path) as file:
+            file.seek(self.start)
+            if self.header.encoding == "ascii":
+                extra = sum(bool(line.strip()) for line in file) - self.count - self.behind
+                said = f"{extra:,} lines"
+            else:
+                end = file.seek(self.count * self.dtype.itemsize + self.behind, 1)
+                extra = self.path.stat().st_size - end
+                if extra <= _LINE_END and not file.read().strip():
+                    return None
+                said = f"{extra:,} bytes (of {self.dtype.itemsize} a point)"
+        if extra <= 0:
+            return None
+        return (
+            f"its header declares {self.count:,} points, wrongly: {said} follow after all that it "
+            "declares, and are not read. Export it again."
+        )
 
     def _records(self, rows: int) -> Iterator[Records]:
         if self.loaded is not None:
@@ -183,7 +212,8 @@ def _placed(
     else:
         dtype = _layout(path, properties, order)
         start += sum(n * _layout(path, words, order).itemsize for _, n, words in elements[:at])
-        scan = PlyScan(path, name, header, dtype, count, start, crs, notes)
+        behind = _behind(path, header.encoding, elements[at + 1 :])
+        scan = PlyScan(path, name, header, dtype, count, start, crs, notes, behind=behind)
     if not any(set(axes) <= set(scan.dtype.names or ()) for axes in _AXES):
         msg = (
             f"{path.name} has vertices without x, y and z; its properties are "
@@ -203,6 +233,15 @@ def _layout(path: Path, properties: list[list[str]], order: str) -> np.dtype[np.
         return np.dtype(fields)
     except ValueError as error:
         raise FormatError(f"{path.name} names a PLY property twice: {error}.") from error
+
+
+def _behind(path: Path, encoding: str, elements: list[Element]) -> int | None:
+    """Return the bytes, of ASCII the lines, of some elements; None: their lists vary in length."""
+    if encoding == "ascii":
+        return sum(count for _, count, _ in elements)
+    if any(words[0] == "list" for _, _, properties in elements for words in properties):
+        return None
+    return sum(count * _layout(path, words, "<").itemsize for _, count, words in elements)
 
 
 def _by_plyfile(path: Path) -> tuple[Records, list[str]]:

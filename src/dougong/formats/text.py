@@ -23,6 +23,7 @@ from dougong.formats.text_columns import column_names, named_columns
 from dougong.formats.text_rows import (
     COMMENTS,
     RowFormat,
+    further_counts,
     is_remark,
     number_in,
     parse_rows,
@@ -91,12 +92,22 @@ class TextScan:
             done += len(table)
             # Columns behind the last name are empty fields after a trailing delimiter.
             yield table[:, : len(self.names)]
-        if self.layout.count is not None and done < self.layout.count:
+        if self.layout.count is not None and done != self.layout.count:
+            self._compare(self.layout.count, done)
+
+    def _compare(self, count: int, done: int) -> None:
+        """Compare the rows found with those that the count lines of all PTS blocks promise."""
+        more = further_counts(self.path, self.layout.start, self.layout.rows.has_old_line_ends)
+        count, lines = count + sum(more), "count lines say" if more else "count line says"
+        if done < count:
             msg = (
-                f"{self.path.name}: its count line says {self.layout.count:,} points, file ends "
-                f"after {done:,}. Copy it again."
+                f"{self.path.name}: its {lines} {count:,} points, file ends after {done:,}. "
+                "Copy it again."
             )
             raise FormatError(msg)
+        note = f"its {lines} {count:,} points, wrongly: {done:,} rows follow, and all are read."
+        if done > count and note not in self.notes:
+            self.notes = (*self.notes, note)
 
     def dtype(self, rows: int) -> np.dtype[np.void]:
         """Return the record layout: whole-numbered columns become integers.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import time
 import weakref
 from collections.abc import Callable, Iterator
@@ -20,6 +21,7 @@ _BLOCK_BYTES = 1 << 26
 _FEW_LINES = 64
 _MISSING = ["nan", "NaN", "NAN", "-nan", "-nan(ind)", "", "null", "NULL", "NA", "None", "-", "*"]
 _PATIENCE_S = 5.0
+_COUNT_LINE = re.compile(rb"^[ \t]*(\d+)[ \t]*\r?$", re.MULTILINE)
 _ASCII = bytes(range(128)) + b"?" * 128
 """No number has other characters, and pyarrow stumbles over bytes that are not UTF-8."""
 
@@ -81,6 +83,17 @@ def _lines(file: IO[bytes], rows: int, has_old_line_ends: bool) -> Iterator[byte
         rest = data[cut:]
     if rest.strip():
         yield rest
+
+
+def further_counts(path: Path, start: int, has_old_line_ends: bool) -> list[int]:
+    """Return the count lines of a PTS file from byte `start` on: of all blocks but the first."""
+    with opened(path) as file:
+        file.seek(start)
+        return [
+            int(line)
+            for data in _lines(file, _BLOCK_BYTES, has_old_line_ends)
+            for line in _COUNT_LINE.findall(data)
+        ]
 
 
 def split_line(line: str, delimiter: str) -> list[str]:
