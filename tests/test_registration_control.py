@@ -296,6 +296,8 @@ def test_a_control_file_is_read_as_it_was_written(tmp_path):
     ("changed", "words"),
     [
         ({"sigma_m": 0}, "point P0: sigma_m is 0"),
+        ({"sigma_m": ""}, "sigma_m is empty; the standard deviation of a surveyed point"),
+        ({"sigma_m": " "}, "pass places that were picked in the clouds to `register --pairs`"),
         ({"role": "chekc"}, "role is 'chekc'; control"),
         ({"source_x": "1,5"}, "decimal point"),
         ({"source_x": "one"}, "source_x is 'one'"),

@@ -47,6 +47,14 @@ def _point(path: Path, number: int, row: Mapping[str, str]) -> dict[str, Any]:
     name = (row["name"] or "").strip()
     if not name:
         raise InputError(f"{path.name}, line {number}: the point has no name. Give it one.")
+    if not (row["sigma_m"] or "").strip():
+        # A default would give places clicked in a cloud the weight of a survey.
+        msg = (
+            f"{path.name}, point {name}: sigma_m is empty; the standard deviation of a surveyed "
+            "point, in metres, is expected. Write it, or pass places that were picked in the "
+            "clouds to `register --pairs`."
+        )
+        raise InputError(msg)
     *coordinates, sigma_m = coordinates_in(path, number, dict(row), (*COORDINATES, "sigma_m"))
     if sigma_m <= 0.0:
         msg = (
