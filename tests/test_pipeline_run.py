@@ -1,6 +1,9 @@
 """The main job around the registration: who moves, what is merged, exit codes, what is kept."""
 
+import errno
 import json
+import os
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +14,7 @@ import dougong
 from dougong.cli import call
 from dougong.cloud import Cloud
 from dougong.filters.selection import Reason
+from dougong.formats.atomic import replacing
 from dougong.pipeline.exports import inverse
 from dougong.pipeline.removed import removed_sample
 from dougong.registration import Register
@@ -257,6 +261,30 @@ def test_a_file_that_cannot_be_read_leaves_no_empty_folder(folder, capsys):
     before = sorted(folder.iterdir())
     assert run(capsys, "--lidar", folder / "one.laz", "--out", folder / "out")[0] == 1
     assert sorted(folder.iterdir()) == before
+
+
+def test_a_full_disk_says_what_stays_and_goes_on_from_there(folder, capsys, monkeypatch):
+    tokens = ["--lidar", folder / "one.laz", "--out", folder / "out"]
+
+    def full(linked, frame, merge, out, *_):
+        with replacing(out / "merged.copc.laz", expected_bytes=2_000_000) as sink:
+            sink.error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            raise sink.error
+
+    with monkeypatch.context() as patched:
+        patched.setattr("dougong.pipeline.run.write_clouds", full)
+        code, answer = run(capsys, *tokens)
+    said = answer["error"]["message"]
+    assert code == 1
+    assert re.search(r"disk is full: .*out/merged.copc.laz needs about .* MB, .* are free\. ", said)
+    assert "The unfinished file was removed; free some space or write elsewhere." in said
+    work = folder / "out.work"
+    assert re.search(rf"filter steps stay in {work} \(\d+\.\d MB\): the same command", said)
+    assert sorted(path.name.split(".")[-1] for path in work.iterdir()) == [
+        "dougong-scratch", "json", "npz",
+    ]  # fmt: skip
+    assert run(capsys, *tokens)[0] == 0
+    assert not work.exists()
 
 
 def test_a_failing_job_leaves_nothing(folder, capsys, monkeypatch):

@@ -277,7 +277,7 @@ def run_project(
     _say_if_cold(progress)
     store, room = _store(out, work), Room.of(memory_bytes)
     refuse_or_announce(asked, folder, room, store.scratch, progress)
-    with result_folder(out) as part:
+    with store.resumable(), result_folder(out) as part:
         document = run(asked, folder, part, store=store, progress=progress, room=room)
         _build_report(part, progress)
     store.finish()
@@ -334,7 +334,7 @@ def demo(
     refuse_too_large_demo(size, memory_bytes)
     _say_if_cold(progress)
     store = _store(folder, work)
-    with result_folder(folder) as part:
+    with store.resumable(), result_folder(folder) as part:
         document = run_demo(
             scene, part, seed=seed, size=size, shown_as=folder, store=store, progress=progress
         )

@@ -76,7 +76,7 @@ def _explain(error: OSError, path: Path, expected_bytes: int) -> OutputError:
     limit = "The file size limit was reached" if error.errno == errno.EFBIG else "The disk is full"
     return OutputError(
         f"{limit}: {path} needs about {_human(expected_bytes)}, {free} are free. "
-        "Nothing was left behind; free some space or write elsewhere."
+        "The unfinished file was removed; free some space or write elsewhere."
     )
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 import dougong
+from dougong.errors import OutputError
 from dougong.params import Parameters
 from dougong.pipeline.books import Books, Page
 from dougong.pipeline.outputs import claim_folder, leave_folder
@@ -65,6 +66,32 @@ class Store:
             yield
         finally:
             leave_folder(self.scratch)
+
+    @contextmanager
+    def resumable(self) -> Iterator[None]:
+        """Have an error of writing say what stays on the disk, and why.
+
+        Raises
+        ------
+        OutputError
+            As in the block.
+        """
+        try:
+            yield
+        except OutputError as error:
+            raise OutputError(" ".join([str(error), *self._stays()])) from error
+
+    def _stays(self) -> list[str]:
+        """Return in words which steps stay for the run that goes on; nothing where none do."""
+        if not any(name.endswith(_COVER) for name in self.folder.names()):
+            return []
+        place = self.folder.local
+        files = [] if place is None else [path for path in place.rglob("*") if path.is_file()]
+        size = f" ({sum(file.stat().st_size for file in files) / 1e6:,.1f} MB)" if files else ""
+        return [
+            f"Finished filter steps stay in {self.folder}{size}: the same command goes on from "
+            "there; delete it if you do not."
+        ]
 
     @property
     def _is_scratch_ours(self) -> bool:
@@ -124,8 +151,11 @@ class Store:
             shutil.rmtree(self.scratch, ignore_errors=True)
 
 
+_COVER = ".books.json"
+
+
 def _cover(key: str) -> str:
-    return f"{key}.books.json"
+    return f"{key}{_COVER}"
 
 
 def _page(key: str, number: int) -> str:
