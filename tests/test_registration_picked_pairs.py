@@ -5,6 +5,7 @@ import pytest
 
 from dougong.cloud import Cloud
 from dougong.errors import InputError, RegistrationError
+from dougong.pipeline.control import read_control
 from dougong.pipeline.pairs import HEADER, read_pairs
 from dougong.registration import Register, register
 from dougong.registration.picked_pairs import PickedPairs, bad_pair, fit_pairs, fit_rigid, starts_of
@@ -196,6 +197,7 @@ def test_a_source_that_lies_on_its_side_is_levelled_by_the_pairs(clouds, run):
 
 
 COLUMNS = ",".join(HEADER)
+SEMICOLONS = ";".join(HEADER)
 
 
 def write(path, rows, header=COLUMNS):
@@ -216,13 +218,28 @@ def test_the_file_is_a_control_file(tmp_path):
     assert len(found.record["sha256"]) == 64
 
 
+@pytest.mark.parametrize("sign", [",", "."])
+def test_a_file_of_a_european_spreadsheet_is_read(tmp_path, sign):
+    row = "Ecke, Süd;scan;-1,5;2;3;500000,125;4000000,5;6;0,003;control".replace(",", sign)
+    path = write(tmp_path / "p.csv", [row, ";;;;;;;;;"], "\ufeff" + SEMICOLONS)
+    found = read_pairs(path, "scan")
+    assert found.source.tolist() == [[-1.5, 2, 3]]
+    assert found.target.tolist() == [[500000.125, 4000000.5, 6]]
+    assert found.names == (f"Ecke{sign} Süd",)
+    assert read_control(path)["scan"].sigma_m.tolist() == [0.003]
+
+
 @pytest.mark.parametrize(
     ("rows", "header", "said"),
     [
         (["a,scan,1,2,x,4,5,6,,"], COLUMNS, "pair a: source_z is 'x'; a number"),
         (["a,scan,1,2,nan,4,5,6,,"], COLUMNS, "source_z is 'nan'"),
         (["a,hall,1,2,3,4,5,6,,"], COLUMNS, "no pair of scan.*names hall"),
-        (["1;2;3"], "x;y;z", "no column source_x.*'x;y;z'.*separated by commas"),
+        (["1;2;3"], "x;y;z", "no column source_x.*'x;y;z'.*separated by commas or semicolons"),
+        (["a,scan,1,5,2,3,4,5,6,,"], COLUMNS, "line 2: .*separate all values by semicolons"),
+        (["a;scan;1,5;2;3;4.5;5;6;;"], SEMICOLONS, "'1,5' and '4.5' do not tell which"),
+        (["a;scan;1,5;2;3;4;4.000.031,5;6;;"], SEMICOLONS, "'1,5' and '4.000.031,5'"),
+        (["a;scan;1,234,567;2;3;4;5;6;;"], SEMICOLONS, "'1,234,567' do not tell"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_refused(tmp_path, rows, header, said):

@@ -19,7 +19,7 @@ from dougong.registration.picked_pairs import PickedPairs
 COORDINATES = ("source_x", "source_y", "source_z", "target_x", "target_y", "target_z")
 HEADER = ("name", "cloud", *COORDINATES, "sigma_m", "role")
 """The header of control files: `cloud` is the source, `role` is control (used) or check (not)."""
-
+_NUMBERS = (*COORDINATES, "sigma_m")
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -110,15 +110,18 @@ def csv_rows(path: Path, needed: Sequence[str] = COORDINATES) -> list[dict[str, 
     except (OSError, UnicodeDecodeError) as error:
         msg = f"{path} cannot be read as text ({error}). Give a CSV file in UTF-8."
         raise InputError(msg) from None
-    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+    head = text.lstrip().partition("\n")[0].strip()
+    # Excel writes lists so where a comma is the decimal sign.
+    delimiter = ";" if ";" in head and "," not in head else ","
+    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True, delimiter=delimiter)
     named = [name.strip().lower() for name in reader.fieldnames or ()]
     reader.fieldnames = named
     missing = [name for name in needed if name not in named]
     if missing:
         msg = (
             f"{path.name} has no column {', '.join(missing)}; its first line is "
-            f"{','.join(named)[:80]!r}. Expected: {','.join(HEADER)}"
-            f"{_may_lack(needed)}, separated by commas."
+            f"{head[:80]!r}. Expected: {','.join(HEADER)}"
+            f"{_may_lack(needed)}, separated by commas or semicolons."
         )
         raise InputError(msg)
     rows = []
@@ -126,12 +129,38 @@ def csv_rows(path: Path, needed: Sequence[str] = COORDINATES) -> list[dict[str, 
         if None in row:
             msg = (
                 f"{path.name}, line {reader.line_num}: it has more values than the first line has "
-                "names. Write numbers with a decimal point, and values separated by commas."
+                "names. Write numbers with a decimal point, or separate all values by semicolons."
             )
             raise InputError(msg)
         if any((value or "").strip() for value in row.values()):
             rows.append(row)
-    return rows
+    return rows if delimiter == "," else _with_points(path, rows)
+
+
+def _with_points(path: Path, rows: list[dict[str, str]]) -> list[dict[str, str]]:
+    """Return rows that semicolons part, with decimal commas as points.
+
+    Raises
+    ------
+    InputError
+        Commas stand beside points, or twice in a number: one of both parts thousands.
+    """
+    numbers = [text for row in rows for name in _NUMBERS if (text := (row.get(name) or "").strip())]
+    with_comma = next((text for text in numbers if "," in text), None)
+    if with_comma is None:
+        return rows
+    odd = next((text for text in numbers if "." in text or text.count(",") > 1), None)
+    if odd is not None:
+        seen = " and ".join(repr(text) for text in dict.fromkeys((with_comma, odd)))
+        msg = (
+            f"{path.name} is separated by semicolons, and {seen} do not tell which sign is the "
+            "decimal one. Write all numbers with one decimal sign, and thousands without any."
+        )
+        raise InputError(msg)
+    return [
+        row | {name: row[name].replace(",", ".") for name in _NUMBERS if row.get(name)}
+        for row in rows
+    ]
 
 
 def _may_lack(needed: Sequence[str]) -> str:
