@@ -322,6 +322,45 @@ def test_merged_clouds_keep_every_attribute_and_know_whose_point_is_whose(tmp_pa
     assert any("its own source_id is replaced" in note for note in again.notes)
 
 
+def timed(folder, name, times, flag):
+    """A LAS cloud with GPS times (n,) under a flag of the header: 1 standard, 0 of a week."""
+    las = laspy.create(point_format=6, file_version="1.4")
+    las.header.global_encoding.gps_time_type = laspy.header.GpsTimeType(flag)
+    las.x = las.y = las.z = np.arange(len(times), dtype=float)
+    las.gps_time = times
+    las.write(folder / f"{name}.las")
+    return read(folder / f"{name}.las")
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_gps_times_of_two_kinds_do_not_stand_under_one_flag(tmp_path, is_first):
+    week = timed(tmp_path, "week", np.full(5, 432_000.5), 0)
+    clouds = [week, timed(tmp_path, "standard", np.full(5, 3.2e8), 1)]
+    clouds += [timed(tmp_path, "none", np.zeros(5), 0), timed(tmp_path, "odd", np.full(5, 3e8), 0)]
+    clouds = clouds if is_first else clouds[::-1]
+    written = write_merged(clouds, tmp_path / "m.laz", source_ids=range(4))
+    merged = laspy.read(tmp_path / "m.laz")
+    assert merged.header.global_encoding.gps_time_type.value == 1
+    assert sorted(set(merged.gps_time.tolist())) == [0.0, 3e8, 3.2e8]
+    (note,) = [note for note in written.notes if "GPS" in note]
+    assert note.startswith("week: its GPS times count the seconds of a week")
+    alone = write_merged(
+        [clouds[2 if is_first else 1], week], tmp_path / "w.laz", source_ids=[1, 2]
+    )
+    merged = laspy.read(tmp_path / "w.laz")
+    assert merged.header.global_encoding.gps_time_type.value == 0
+    assert merged.gps_time.max() == 432_000.5
+    assert not alone.notes
+
+
+def test_a_cloud_without_times_leaves_the_flag_to_those_with(tmp_path):
+    week = timed(tmp_path, "week", np.full(5, 432_000.5), 0)
+    write_merged([Cloud.from_points(np.eye(3)), week], tmp_path / "m.laz", source_ids=[1, 2])
+    merged = laspy.read(tmp_path / "m.laz")
+    assert merged.header.global_encoding.gps_time_type.value == 0
+    assert merged.gps_time.max() == 432_000.5
+
+
 def test_merged_clouds_get_the_finest_step_and_stay_where_they_are(tmp_path):
     frame = Frame(origin=np.array([500_000.0, 4_000_000.0, 0.0]))
     random_las(

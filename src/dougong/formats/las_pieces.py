@@ -11,10 +11,12 @@ from dougong._boxes import corners_of
 from dougong.cloud import Cloud, Pieces, Records
 from dougong.errors import InputError
 from dougong.formats.las import waveform_channels
-from dougong.formats.las_fields import Facts, facts_of
+from dougong.formats.las_fields import Facts, canonical, facts_of
 from dougong.formats.las_header import LasHeader
 from dougong.formats.las_records import Whole, las_parts, set_integers
 from dougong.typing import Points
+
+_WEEK_S = 7 * 86_400.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +34,22 @@ class LasForm:
     modern: bool
     packed: bool
     whole: Whole
+    last_time: float | None
+    """Latest GPS time in seconds; None: there is none, or all are 0."""
+
+    @property
+    def has_standard_time(self) -> bool:
+        """Say whether its GPS times are adjusted standard ones (LAS 1.4 R15, table 4)."""
+        return self.last_time is not None and bool(self.header.raw[6] & 1)
+
+    @property
+    def has_week_time(self) -> bool:
+        """Say whether its GPS times count the seconds of a week.
+
+        Programs forget to flag standard times: those that no week has are none.
+        """
+        is_flagged = self.has_standard_time
+        return self.last_time is not None and not is_flagged and self.last_time <= _WEEK_S
 
     def records(self, piece: Cloud) -> Records:
         """Return the records of one piece."""
@@ -51,11 +69,13 @@ class _Survey:
     """(2, 3) integer coordinates of records that stay as they are."""
     facts: dict[str, Facts] = field(default_factory=dict)
     channels: set[int] = field(default_factory=set)
+    last_time: float | None = None
 
     def add(self, piece: Cloud) -> None:
         self.points += len(piece)
         if not len(piece):
             return
+        self._look_at_times(piece)
         if isinstance(piece.header, LasHeader):
             self.channels |= waveform_channels(piece.records)
         else:
@@ -72,6 +92,14 @@ class _Survey:
         low, high = corners_of(there)
         self.box[0] = np.minimum(self.box[0], low)
         self.box[1] = np.maximum(self.box[1], high)
+
+    def _look_at_times(self, piece: Cloud) -> None:
+        for name in piece.attributes:
+            values = piece.attribute(name) if canonical(name) == "gps_time" else None
+            if values is None or values.dtype.kind != "f" or not values.any():
+                continue
+            latest = float(np.fmax.reduce(values, initial=-np.inf))
+            self.last_time = latest if self.last_time is None else max(self.last_time, latest)
 
 
 def _keeps_integers(piece: Cloud) -> bool:
@@ -127,4 +155,5 @@ def las_form(pieces: Pieces, *, modern: bool = False, packed: bool = False) -> L
         modern=modern,
         packed=packed,
         whole=whole,
+        last_time=survey.last_time,
     )

@@ -82,6 +82,7 @@ def write_merged(
     if not parts:
         raise OutputError(f"no cloud has a point left, so {path.name} was not written.")
     notes: list[str] = []
+    parts = _with_one_time(parts, notes)
     header = _joined_header(parts, notes)
     points = sum(part.form.points for part in parts)
     write_las_records(path, family, header, _records(parts, header), points=points, hold=hold)
@@ -97,6 +98,24 @@ class _Part(NamedTuple):
     form: LasForm
     ident: int
     crs: str | None
+    has_time: bool = True
+    """False: its GPS times are not those of the file, and become 0."""
+
+
+def _with_one_time(parts: Sequence[_Part], notes: list[str]) -> list[_Part]:
+    """Return the parts; beside standard times those that count the seconds of a week are dropped.
+
+    The kind of time is one flag for the file, and which week it was is written nowhere.
+    """
+    weekly = {part.form.name for part in parts if part.form.has_week_time}
+    if not any(part.form.has_standard_time for part in parts):
+        return list(parts)
+    notes += [
+        f"{name}: its GPS times count the seconds of a week, those of other clouds are standard "
+        "times, and a file holds one kind: they are 0 here."
+        for name in sorted(weekly)
+    ]
+    return [part._replace(has_time=not part.form.has_week_time) for part in parts]
 
 
 def _refuse_mixed_frames(clouds: Sequence[Cloud]) -> None:
@@ -131,7 +150,9 @@ def _joined_header(parts: Sequence[_Part], notes: list[str]) -> LasHeader:
     ]
     extras["source_id"] = np.dtype("<u2" if wide else "u1")
     known = _descriptions([form.header for form in forms], extras, notes)
-    header = describe_extras(_base(first, point_format), extras, known)
+    timed = [form for form in forms if form.last_time is not None] or forms[:1]
+    is_standard = any(form.header.raw[6] & 1 for form in timed)
+    header = describe_extras(_base(first, point_format, is_standard), extras, known)
     return with_crs(header, parts[0].crs, notes).with_scaling(scale, offset)
 
 
@@ -143,16 +164,16 @@ def _records(parts: Sequence[_Part], header: LasHeader) -> Iterator[Records]:
             merged = np.zeros(len(own), dtype=header.dtype)
             _fill(merged, part.form.header, own, header)
             merged["source_id"] = part.ident
+            if not part.has_time:
+                merged["gps_time"] = 0.0
             yield merged
 
 
-def _base(first: LasHeader, point_format: int) -> LasHeader:
+def _base(first: LasHeader, point_format: int, is_standard: bool) -> LasHeader:
     """Return a fresh header that carries on the first cloud's foreign records."""
     header = new_header(point_format)
     kept: tuple[Vlr, ...] = tuple(vlr for vlr in first.vlrs if vlr.key[0] not in _HISTORY)
-    # The kind of GPS time (week or standard) is one flag for the file.
-    flags = 0b10000 | (first.raw[6] & 1)
-    return replace(header, vlrs=kept).patched("H", 6, flags)
+    return replace(header, vlrs=kept).patched("H", 6, 0b10000 | is_standard)
 
 
 def _kept_offset(

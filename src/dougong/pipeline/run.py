@@ -147,7 +147,11 @@ def _result(project: Project, loader: Loader, out: Path) -> dict[str, Any]:
         "software": software(),
         "parameters": project_document(project, loader.shown),
         "inputs": list(loader.inputs.values()),
-        "notes": [*notes_of(linked), *full_notes(full)],
+        "notes": [
+            *notes_of(linked),
+            *(f"{merged['file']}: {note}" for note in merged["notes"]),
+            *full_notes(full),
+        ],
     }
 
 

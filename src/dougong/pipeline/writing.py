@@ -64,13 +64,14 @@ def write_clouds(
         chosen = choose(parts, merge, hold)
     progress.stage(f"writing {MERGED}")
     with clock.measure("write"):
-        write_merged(
+        written = write_merged(
             [_left(pieces, kept) for pieces, kept in zip(painted, chosen.kept, strict=True)],
             out / MERGED,
             source_ids=[part.source_id for part in parts],
             hold=hold,
         )
-    return {"file": MERGED, **_merged_document(parts, chosen, progress)}
+    document = _merged_document(parts, chosen, progress)
+    return {"file": MERGED, **document, "notes": list(written.notes)}
 
 
 def _merged_document(parts: Sequence[Part], chosen: Merged, progress: Progress) -> dict[str, Any]:
