@@ -1,6 +1,7 @@
 """``run --full-resolution``: every station again, moved, nothing taken but what is not sure."""
 
 import json
+import re
 import shutil
 from collections import namedtuple
 from pathlib import Path
@@ -12,6 +13,7 @@ import dougong
 from dougong.cli import call
 from dougong.cloud import Cloud
 from dougong.formats import read
+from dougong.pipeline import full_resolution
 from dougong.pipeline.full_resolution import output_names
 from dougong.registration.result import Hypothesis, Registration
 from e57_surveys import survey, turn
@@ -163,6 +165,31 @@ def test_ctrl_c_while_writing_leaves_nothing_and_it_goes_again(folder, capsys, m
     code, result = run(capsys, *tokens)
     assert code == 3
     assert len(result["full_resolution"]["files"]) == 3
+
+
+@pytest.mark.parametrize("when", ["before", "meanwhile", "gone"])
+def test_a_file_replaced_during_the_run_is_refused(folder, capsys, monkeypatch, when):
+    """It got the matrix and the hash of the file that had been registered."""
+    tower = folder / "tower.laz"
+    done = full_resolution._write
+
+    def replaced(file, *rest):
+        written = done(file, *rest)
+        if (file == tower) == (when == "meanwhile"):
+            tower.unlink()
+            if when != "gone":
+                dougong.write(read(folder / "drone.copc.laz"), tower)
+        return written
+
+    monkeypatch.setattr(full_resolution, "_write", replaced)
+    tokens = [folder / "project.toml", "--out", folder / "out", "--full-resolution"]
+    code, answer = run(capsys, *tokens)
+    said = answer["error"]["message"]
+    assert code == 1
+    assert str(tower) in said
+    words = "cannot be read any more" if when == "gone" else r"was changed or .* bytes of .* now\."
+    assert re.search(words, said)
+    assert not (folder / "out").exists()
 
 
 def test_names():

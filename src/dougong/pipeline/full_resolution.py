@@ -57,6 +57,7 @@ def write_full_resolution(
     *,
     reference: str,
     inputs: Mapping[Path, Mapping[str, Any]],
+    require_unchanged: Callable[[Path], None],
     shown: Callable[[Path], str],
     progress: Progress,
 ) -> dict[str, Any]:
@@ -72,6 +73,8 @@ def write_full_resolution(
     reference : str
     inputs : mapping
         What is known of each file: path, sha256, points.
+    require_unchanged : callable
+        Refuses a file that is not the one that was registered any more.
     shown : callable
         How a path is named in the results.
 
@@ -96,7 +99,9 @@ def write_full_resolution(
         if all(place.matrix is None for place in mine):
             continue
         progress.stage(f"writing {FOLDER}/{name} at full resolution")
+        require_unchanged(file)
         written = _write(file, folder / name, mine, target)
+        require_unchanged(file)
         document: dict[str, Any] = {
             "file": f"{FOLDER}/{written.path.name}",
             "input": inputs[file],

@@ -19,7 +19,7 @@ from dougong.pipeline.memory import Room
 from dougong.pipeline.movers import Mover, Source
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Entry, files_of
-from dougong.pipeline.provenance import Clock, sha256
+from dougong.pipeline.provenance import Clock, Stamp, require_unchanged, sha256, stamp_of
 from dougong.pipeline.recipes import Recipe, filter_cloud, steps_of
 from dougong.pipeline.removed import removed_sample
 from dougong.pipeline.spooling import spooled
@@ -49,6 +49,8 @@ class Loader:
     scratch: Path
     """Gets what is of use to this run only."""
     inputs: dict[Path, dict[str, Any]] = field(default_factory=dict)
+    stamps: dict[Path, Stamp] = field(default_factory=dict)
+    """Of each file as it was when its hash was taken."""
     waiting: int = 0
     """Filtered points that wait in memory."""
     units: dict[str, float | None] = field(default_factory=dict)
@@ -85,6 +87,7 @@ class Loader:
 
     def _sources(self, entry: Entry, file: Path) -> Iterator[Source]:
         self.progress.stage(f"reading {file.name}")
+        self.stamps[file] = stamp_of(file)
         with self.clock.measure("read"):
             digest = sha256(file)
         if entry.name in self.units and self.units[entry.name] is None:
@@ -102,6 +105,10 @@ class Loader:
             self.inputs[file]["points"] += source.points_in
             self.waiting += source.kept.points if source.kept.is_held else 0
             yield source
+
+    def require_unchanged(self, file: Path) -> None:
+        """Refuse a file that was replaced since its hash was taken; see `provenance`."""
+        require_unchanged(file, self.stamps[file])
 
     def _placed(self, entry: Entry, cloud: Cloud) -> Cloud:
         """Return a cloud in the system that its entry names, or in the unit that was found."""
@@ -121,6 +128,7 @@ class Loader:
         """Read the file and leave it as it is: its unit is not known, and filters need metres."""
         with self.clock.measure("read"):
             cloud = self._placed(entry, read(file))
+        self.require_unchanged(file)
         nothing = np.zeros(len(cloud), dtype=np.uint8)
         filtered = Filtered(cloud=cloud, codes=nothing, ground_class=nothing, stages=())
         noticed = (*self._noticed(entry, cloud), "not filtered, since its scale is not known")
@@ -132,6 +140,7 @@ class Loader:
         with self.clock.measure("read"):
             clouds = [read(file)] if entry.registered else read_stations(file)
             clouds = [self._placed(entry, cloud) for cloud in clouds]
+        self.require_unchanged(file)
         for station in range(len(clouds)):
             # Each raw cloud is let go as soon as it is filtered.
             cloud, clouds[station] = clouds[station], clouds[station].select(np.arange(0))
@@ -175,6 +184,7 @@ class Loader:
                         scratch=scratch,
                         progress=self.progress,
                     )
+                self.require_unchanged(file)
                 self.store.save(key, books)
                 if self.store.is_temporary:
                     folder.remove()

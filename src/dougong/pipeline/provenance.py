@@ -6,11 +6,13 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import dougong
+from dougong.errors import FormatError
 from dougong.formats.stream import opened
 from dougong.kernels import _jit
 
@@ -30,6 +32,48 @@ def sha256(path: Path) -> str:
         while block := file.read(1 << 22):
             digest.update(block)
     return digest.hexdigest()
+
+
+Stamp = tuple[int, int]
+"""Bytes of a file, and when it was last written, nanoseconds."""
+
+
+def stamp_of(path: Path) -> Stamp:
+    """Return what differs when a file was written again, or another put in its place.
+
+    Raises
+    ------
+    FormatError
+        It is not there.
+    """
+    try:
+        found = path.stat()
+    except OSError as error:
+        msg = f"{path} cannot be read any more: {error.strerror}. Put it back."
+        raise FormatError(msg) from error
+    return found.st_size, found.st_mtime_ns
+
+
+def require_unchanged(path: Path, before: Stamp) -> None:
+    """Refuse to go on with a file that was replaced since `before`: what is known is the old one's.
+
+    Raises
+    ------
+    FormatError
+        It was, or it is gone.
+    """
+    now = stamp_of(path)
+    if now == before:
+        return
+    was, is_now = (
+        f"{size:,} bytes of {datetime.fromtimestamp(time_ns / 1e9):%Y-%m-%d %H:%M:%S}"
+        for size, time_ns in (before, now)
+    )
+    msg = (
+        f"{path} was changed or replaced while it was worked on: it was {was} and is {is_now} "
+        "now. Leave it as it is, and give the same command again."
+    )
+    raise FormatError(msg)
 
 
 def software() -> dict[str, Any]:

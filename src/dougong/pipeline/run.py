@@ -121,6 +121,7 @@ def _result(project: Project, loader: Loader, out: Path) -> dict[str, Any]:
                 out,
                 reference=reference.name,
                 inputs=loader.inputs,
+                require_unchanged=loader.require_unchanged,
                 shown=loader.shown,
                 progress=progress,
             )
