@@ -226,6 +226,8 @@ def test_a_matrix_is_applied_to_the_units_it_is_for(tmp_path, capsys):
     assert "names no coordinate system: its numbers are taken for those of scan, in units" in str(
         applied(tmp_path, None, {"source_frame": FEET}, capsys)
     )
+    worded = {"source_frame": FEET | {"unit_m": [0.3048006096] * 3}}
+    applied(tmp_path, "EPSG:2263", worded, capsys)
     searched = {"source_frame": FEET, "scale_search": {"side": "source"}}
     applied(tmp_path, "EPSG:32650", searched, capsys)
     elsewhere = {"source_frame": {"crs_wkt": "EPSG:32649", "unit_m": [1, 1, 1]}}

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dougong.cloud import Frame
 from dougong.errors import FrameError
 from dougong.formats import (
@@ -109,7 +111,10 @@ def _require_unit(input: Path, crs: str | None, unit_m: Unit | None, known: Know
         info, nowhere = describe(input), (0.0, 0.0, 0.0)
         low, high = info.extent_min or nowhere, info.extent_max or nowhere
         raise FrameError(metric_problem(crs, low, high, input.name))
-    if unit_m is None or known.source_unit_m is None or unit_m == known.source_unit_m:
+    if unit_m is None or known.source_unit_m is None:
+        return
+    # A foot differs in its last digits with the text that names it; US and international by 2e-6.
+    if np.allclose(unit_m, known.source_unit_m, rtol=1e-9, atol=0.0):
         return
     own = _unit_name(unit_m) + (f" ({units.name})" if units.name else "")
     source = known.source or "its source"
