@@ -13,15 +13,21 @@ from dougong.registration.control import Adjusted, Control, adjust, weigh_contro
 from dougong.registration.covariance import displacement95
 from dougong.registration.evidence import Court, hear, summon
 from dougong.registration.handedness import LEFT_SENTENCE, OPEN_SENTENCE, handedness
-from dougong.registration.icp import Icp, build_levels, refine
+from dougong.registration.icp import Icp, Level, build_levels, refine
 from dougong.registration.laps import Laps
 from dougong.registration.look_alikes import look_alike_doubt
 from dougong.registration.overlap import apply
 from dougong.registration.prepare import Prepared
 from dougong.registration.probability import BELIEF, Evidence
-from dougong.registration.result import FineResult, Hypothesis
-from dougong.registration.rivals import is_same, middle_of
-from dougong.registration.roof_sides import height_left_open, weigh_height
+from dougong.registration.result import FineResult, Hypothesis, Status
+from dougong.registration.rivals import is_near, is_same, middle_of
+from dougong.registration.roof_sides import (
+    LEFT_OUT,
+    UNHELD,
+    are_roofs_unsure,
+    ground_says,
+    without_unsure_roofs,
+)
 from dougong.registration.scale_check import size_doubt
 from dougong.registration.settings import Register
 from dougong.registration.told_by_ground import told_by_ground
@@ -49,6 +55,29 @@ class Found:
     """With the control points; None: there are none, or they changed nothing."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Heard:
+    """The best pose of a pair and what the proof says of it, before it is doubted."""
+
+    source: Prepared
+    target: Prepared
+    court: Court
+    levels: tuple[Level, ...]
+    quick: Icp
+    ruling: Ruling
+    fine: FineResult | None
+    adjusted: Adjusted | None
+    status: Status
+    reason: str
+    spread_m: float
+    """How closely the blocks hold the pose, metres; inf: unknown."""
+
+    @property
+    def T(self) -> Transform:
+        """Return the pose (source -> target), as exact as it is known."""
+        return self.ruling.winner.T if self.fine is None else self.fine.T_target_source
+
+
 def decide(
     source: Prepared,
     target: Prepared,
@@ -63,24 +92,128 @@ def decide(
         return refused(
             "the coarse search found no pose at which the two clouds have anything in common."
         )
-    court = summon(source, target)
-    quick = _quick(_icp(params), source, target)
-    levels = build_levels(source, target, quick)
+    poses = [h.T_target_source for h in starts]
+    heard = _hear((source, target), poses, params, control, clock)
+    heard = _without_roofs_in_doubt(heard, poses, params, control, clock)
+    answer = _doubted(heard, params, clock)
+    if answer is None:
+        return refused(LEFT_SENTENCE)
+    status, reason, evidence = answer
+    adjusted, ruling = heard.adjusted, heard.ruling
+    status, reason = weigh_control(status, reason, adjusted)
+    listed = _listed(ruling, heard.T, starts, source, target)
+    return Found(
+        status=status,
+        reason=reason,
+        T=None if status == "failed" else heard.T,
+        fine=heard.fine,
+        probability=_probability(status, ruling, evidence),
+        hypotheses=listed,
+        margin=_margin(listed),
+        ruling=ruling,
+        evidence=evidence,
+        adjusted=adjusted,
+    )
+
+
+def _hear(
+    clouds: tuple[Prepared, Prepared],
+    poses: Sequence[Transform],
+    params: Register,
+    control: Control | None,
+    clock: Laps,
+) -> _Heard:
+    """Return the best of what the poses lead to, fitted exactly, and whether it is proven."""
+    court, quick = summon(*clouds), _quick(_icp(params), *clouds)
+    levels = build_levels(*clouds, quick)
     ruling = rule(
         court,
         levels,
-        [h.T_target_source for h in starts],
+        poses,
         quick,
         params.verdict,
         lambda T: _is_near_hint(T, params) and (control is None or control.allows(T)),
     )
-    ruling = told_by_ground(court, (source, target), levels, ruling, quick, params.verdict)
+    ruling = told_by_ground(court, clouds, levels, ruling, quick, params.verdict)
     clock.lap("proof")
-    fine, adjusted = _refined(source, target, ruling, params, control)
-    T = ruling.winner.T if fine is None else fine.T_target_source
+    fine, adjusted = _refined(*clouds, ruling, params, control)
     clock.lap("fine")
     status, reason, spread = _judged(court, ruling, fine, params)
-    evidence = _evidence(ruling, spread)
+    return _Heard(
+        source=clouds[0],
+        target=clouds[1],
+        court=court,
+        levels=levels,
+        quick=quick,
+        ruling=ruling,
+        fine=fine,
+        adjusted=adjusted,
+        status=status,
+        reason=reason,
+        spread_m=spread,
+    )
+
+
+def _without_roofs_in_doubt(
+    heard: _Heard,
+    poses: Sequence[Transform],
+    params: Register,
+    control: Control | None,
+    clock: Laps,
+) -> _Heard:
+    """Return what a pair says without roofs of unknown side, if they may hold its height wrongly.
+
+    What was heard with them stays where the ground or control points hold the height, where turns
+    are undecided (less of the building does not tell them apart), and where all else holds the same
+    pose: with the roofs it is the more exact one.
+    """
+    if heard.adjusted is not None or not are_roofs_unsure(heard.source, heard.target):
+        return heard
+    at, winner = heard.ruling.middle, heard.ruling.winner.T
+    is_turned = any(not is_near(c.T, winner, at) for c in heard.ruling.undecided)
+    if is_turned or _ground_says(heard, heard.T) == "agrees":
+        return heard
+    rest = _rest(heard, poses, params, control, clock)
+    if rest is None or _ground_says(heard, rest.T) == "differs":
+        return replace(heard, status="ambiguous", reason=UNHELD) if heard.status == "ok" else heard
+    apart = np.linalg.norm(apply(rest.T, at[None]) - apply(heard.T, at[None]))
+    if heard.status == "ok" and apart <= params.verdict.most_spread_m:
+        return heard
+    return replace(rest, reason=rest.reason + LEFT_OUT)
+
+
+def _rest(
+    heard: _Heard,
+    poses: Sequence[Transform],
+    params: Register,
+    control: Control | None,
+    clock: Laps,
+) -> _Heard | None:
+    """Return what is proven without roofs of unknown side; None: nothing is."""
+    T, rest = heard.T, None
+    # What lies near a roof under a pose that is a roof's thickness off is asked once more.
+    for _ in range(2):
+        without = without_unsure_roofs(heard.source, heard.target, T)
+        rest = None if without is None else _hear(without, [T, *poses], params, control, clock)
+        if rest is None or rest.status != "ok":
+            return None
+        T = rest.T
+    return rest
+
+
+def _ground_says(heard: _Heard, T: Transform) -> Literal["agrees", "differs", "nothing"]:
+    return ground_says(heard.court, heard.source, heard.target, T)
+
+
+def _doubted(heard: _Heard, params: Register, clock: Laps) -> tuple[Status, str, Evidence] | None:
+    """Return status, reason and evidence after every doubt was heard; None: it is left-handed."""
+    status, reason, evidence = heard.status, heard.reason, _evidence(heard.ruling, heard.spread_m)
+    if reason == UNHELD:
+        # The other side of the roof is one more pose that fits as well.
+        evidence = _with_one_more(evidence)
+    source, target, court, ruling, fine = (
+        heard.source, heard.target, heard.court, heard.ruling, heard.fine,
+    )  # fmt: skip
     if status == "ok" and fine is not None and params.fine == "point-to-point":
         pulled = _weigh_points(source, target, ruling, fine, params)
         if pulled is not None:
@@ -90,40 +223,21 @@ def decide(
         if alike is not None:
             status, reason, evidence = "ambiguous", alike, _with_one_more(evidence)
     if status == "ok" and fine is not None:
-        doubt = size_doubt(source, target, T, _icp(params), params.verdict.most_spread_m)
+        doubt = size_doubt(source, target, heard.T, _icp(params), params.verdict.most_spread_m)
         if doubt is not None:
             (reason, moved), status = doubt, "ambiguous"
             evidence = replace(evidence, spread_m=moved)
-    if status == "ok" and fine is not None and adjusted is None:
-        left_open = height_left_open(court, source, target, T)
-        status, reason = weigh_height(reason, left_open)
-        if status != "ok":
-            # The other side of the roof is one more pose that fits as well.
-            evidence = _with_one_more(evidence)
     if status == "ok":
-        hand = handedness(court, levels, ruling.winner, quick, params.verdict)
+        hand = handedness(court, heard.levels, ruling.winner, heard.quick, params.verdict)
         if hand == "left":
-            return refused(LEFT_SENTENCE)
+            return None
         if hand == "open":
             status, reason, evidence = "ambiguous", OPEN_SENTENCE, _with_one_more(evidence)
         reason += " Its mirror image fits as well." if hand == "unknown" else ""
         clock.lap("mirror check")
-    if status == "ok" and not _is_near_hint(T, params):
-        status, reason = "ambiguous", _off_hint(T, params)
-    status, reason = weigh_control(status, reason, adjusted)
-    listed = _listed(ruling, T, starts, source, target)
-    return Found(
-        status=status,
-        reason=reason,
-        T=None if status == "failed" else T,
-        fine=fine,
-        probability=_probability(status, ruling, evidence),
-        hypotheses=listed,
-        margin=_margin(listed),
-        ruling=ruling,
-        evidence=evidence,
-        adjusted=adjusted,
-    )
+    if status == "ok" and not _is_near_hint(heard.T, params):
+        status, reason = "ambiguous", _off_hint(heard.T, params)
+    return status, reason, evidence
 
 
 def _evidence(ruling: Ruling, spread_m: float) -> Evidence:

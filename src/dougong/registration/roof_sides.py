@@ -1,97 +1,125 @@
-"""Whether the height rests on roofs of which nobody knows the side.
+"""Whether the height rests on roofs of which nobody knows the side, and the clouds without them.
 
 A scan without its stations shows a roof, and nothing beneath it: a roof that was seen from a tower,
 or a soffit over a closed room. The drone shows the top. Both readings fit, apart by the roof's
 thickness, and every block of the building agrees about the wrong one. Ground that both clouds show
-decides: no instrument sees it from below. Where it is missing, the pose is held against itself,
-raised and lowered, by all that is not such a roof: sills, ledges, walls.
+decides: no instrument sees it from below. Where it is missing, the pair is heard without such roofs
+and what lies on them: battered walls, sills, ledges and bases hold the height within millimetres
+where there are some, and say that they do not where there are none.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from dougong.filters import neighbourhood
+from dougong.filters.neighbourhood import build_index
 from dougong.registration.covariance import blocks_of
-from dougong.registration.evidence import Court, Witness, hear
-from dougong.registration.overlap import apply, inverse
-from dougong.registration.prepare import Prepared
+from dougong.registration.evidence import Court
+from dougong.registration.overlap import Rung, apply, inverse
+from dougong.registration.prepare import MIN_POINTS, Prepared
 from dougong.typing import Mask, Points, Transform, Values
 
-_HEIGHTS_M = (0.15, -0.15, 0.25, -0.25, 0.4, -0.4)
-"""How thick roofs are."""
 _REACH_M = 0.7
+_FLAT, _LEVEL = 0.7, 0.9
+"""Planarity, and the rise of the normal, of ground that tells a height."""
+_NEIGHBOURS = 16
+"""As many as planes are fitted to."""
+_ALIKE_COSINE = 0.93
+"""Within 21 degrees: noisy planes of one surface are, those about an edge are not."""
 _BLOCK_M = 5.0
 _LEAST_BLOCKS = 5
 """Ground in fewer places may be a terrace, a floor or a parked car."""
 _AGREES_M = 0.05
 """A third of the thinnest roof: ground as far apart as this is on the same side of it."""
 
+LEFT_OUT = (
+    " Roofs of which nobody knows the side were left out: all else holds the height without them."
+)
+UNHELD = (
+    "the height rests on roofs of which nobody knows whether they were seen from above or from "
+    "below, and nothing else holds it. Give the scan with its stations (E57, PTX), ground in both "
+    "clouds, or a control point."
+)
 
-def height_left_open(
-    court: Court, source: Prepared, target: Prepared, T: Transform
-) -> float | None:
-    """Return a change of height that only roofs of unknown side speak against.
 
-    All else need not prove the height, which the fit has done: it must not prefer another one.
-    Without ground the ledges that speak are few, and a fit to the wrong side of a roof is seen by
-    their preferring its thickness back.
+def are_roofs_unsure(source: Prepared, target: Prepared) -> bool:
+    """Say whether two clouds may show the two sides of one roof, and nothing tells which."""
+    return source.kind != target.kind and bool(
+        np.any(source.side_is_unknown) or np.any(target.side_is_unknown)
+    )
+
+
+def without_unsure_roofs(
+    source: Prepared, target: Prepared, T: Transform
+) -> tuple[Prepared, Prepared] | None:
+    """Return of two clouds the inside of every surface that no roof of unknown side speaks for.
+
+    Without such roofs, without what lies near them in either cloud, and without edges: where two
+    surfaces meet, planes are of both. A wall's corner with its roof holds the roof's height, and
+    one with the ground the height at which the other cloud's wall ends.
 
     Parameters
     ----------
-    court : Court
-        Of `source` and `target`.
     T : ndarray, shape (4, 4)
-        The pose that is judged, local frames.
+        Source to target, local frames: under which what lies near what is asked.
 
     Returns
     -------
-    float or None
-        Metres along the vertical; None where all else prefers `T`, or where both clouds come from
-        instruments that show roofs from the same side.
+    tuple of Prepared, or None
+        None where too little is left.
     """
-    unknown = (_is_unknown(source, court.source), _is_unknown(target, court.target))
-    if source.kind == target.kind or not (unknown[0].any() or unknown[1].any()):
+    of_source = _is_inside(source) & _is_off_roofs(source, target, T)
+    of_target = _is_inside(target) & _is_off_roofs(target, source, inverse(T))
+    if min(int(of_source.sum()), int(of_target.sum())) < MIN_POINTS:
         return None
-    if ground_agrees(court, source, target, T):
-        return None
-    kept = replace(
-        court,
-        source=_silenced(court.source, court.target, T, unknown[0], target),
-        target=_silenced(court.target, court.source, inverse(T), unknown[1], source),
-    )
-    loss = hear(kept, T).total
-    for height in _HEIGHTS_M:
-        raised = T.copy()
-        raised[:3, 3] += height * target.up
-        if hear(kept, raised).total <= loss:
-            return height
-    return None
+    return source.chosen(of_source), target.chosen(of_target)
 
 
-def ground_agrees(court: Court, source: Prepared, target: Prepared, T: Transform) -> bool:
+def _is_inside(cloud: Prepared) -> Mask:
+    """Return which points (n,) lie inside a surface: the planes of all about them are as theirs."""
+    near, _ = neighbourhood.knn(build_index(cloud.xyz), cloud.xyz, _NEIGHBOURS + 1)
+    alike = np.einsum("ij,ikj->ik", cloud.normals, cloud.normals[np.maximum(near, 0)])
+    is_inside: Mask = np.all((np.abs(alike) > _ALIKE_COSINE) | (near < 0), axis=1)
+    return is_inside
+
+
+def _is_off_roofs(cloud: Prepared, other: Prepared, T: Transform) -> Mask:
+    """Return which points (n,) are near no roof of unknown side, the cloud's own nor the other's.
+
+    T : (4, 4) from the cloud to the other.
+    """
+    is_off = np.ones(len(cloud.xyz), bool)
+    for one, points in ((cloud, cloud.xyz), (other, apply(T, cloud.xyz))):
+        roofs = one.xyz[np.broadcast_to(one.side_is_unknown, len(one.xyz))]
+        if len(roofs):
+            near, _ = neighbourhood.nearest(build_index(roofs), points, _REACH_M)
+            is_off &= near < 0
+    return is_off
+
+
+def ground_says(
+    court: Court, source: Prepared, target: Prepared, T: Transform
+) -> Literal["agrees", "differs", "nothing"]:
     """Say whether the ground of both clouds is at one height: by the medians of 5 m blocks."""
-    points = apply(T, court.source.points[_is_ground(source, court.source)])
-    target_is_ground = target.is_ground[court.target.everything.index]
-    index, _ = neighbourhood.nearest(court.target.everything.neighbours, points, _REACH_M)
-    pairs = (index >= 0) & target_is_ground[np.maximum(index, 0)]
+    first, second = court.source.everything, court.target.everything
+    points = apply(T, first.xyz[first.asked][_is_level_ground(source, first)[first.asked]])
+    index, _ = neighbourhood.nearest(second.neighbours, points, _REACH_M)
+    pairs = (index >= 0) & _is_level_ground(target, second)[np.maximum(index, 0)]
     points, index = points[pairs], index[pairs]
     if not len(points):
-        return False
-    normals = court.target.everything.normals[index]
-    tilt = normals @ target.up
-    offset = np.einsum("ij,ij->i", normals, points - court.target.everything.xyz[index])
-    # Along the vertical; a normal far from it is no ground's.
-    is_level = np.abs(tilt) > 0.5
-    heights = _block_medians(points[is_level], (offset / np.where(tilt, tilt, 1.0))[is_level])
+        return "nothing"
+    normals = second.normals[index]
+    # Along the vertical.
+    offset = np.einsum("ij,ij->i", normals, points - second.xyz[index]) / (normals @ target.up)
+    heights = _block_medians(points, offset)
     if len(heights) < _LEAST_BLOCKS:
-        return False
+        return "nothing"
     middle = float(np.median(heights))
     spread = 1.4826 * float(np.median(np.abs(heights - middle))) / np.sqrt(len(heights))
-    return bool(abs(middle) + 2.0 * spread <= _AGREES_M)
+    return "agrees" if abs(middle) + 2.0 * spread <= _AGREES_M else "differs"
 
 
 def _block_medians(points: Points, values: Values) -> Values:
@@ -104,36 +132,12 @@ def _block_medians(points: Points, values: Values) -> Values:
     return np.array([np.median(part) for part in parts if len(part) >= 3])
 
 
-def _is_ground(cloud: Prepared, witness: Witness) -> Mask:
-    heard = witness.everything.index[witness.everything.asked]
-    is_ground: Mask = cloud.is_ground[heard]
-    return is_ground
+def _is_level_ground(cloud: Prepared, everything: Rung) -> Mask:
+    """Return which points (n,) of a rung are ground and lie level: the feet of walls are neither.
 
-
-def weigh_height(reason: str, left_open_m: float | None) -> tuple[Literal["ok", "ambiguous"], str]:
-    """Return the status of a pose that is proven but for its height, and why."""
-    if left_open_m is None:
-        return "ok", reason
-    way = "higher" if left_open_m > 0.0 else "lower"
-    return "ambiguous", (
-        "the height rests on roofs of which nobody knows whether they were seen from above or from "
-        f"below: all else fits {abs(left_open_m):.2g} m {way} as well. Give the scan with its "
-        "stations (E57, PTX), ground in both clouds, or a control point."
-    )
-
-
-def _is_unknown(cloud: Prepared, witness: Witness) -> Mask:
-    """Say which heard points are of a roof of unknown side."""
-    heard = witness.everything.index[witness.everything.asked]
-    is_unknown: Mask = np.broadcast_to(cloud.side_is_unknown, len(cloud.xyz))[heard]
-    return is_unknown
-
-
-def _silenced(
-    from_: Witness, to: Witness, T: Transform, is_unknown: Mask, other: Prepared
-) -> Witness:
-    """Return the witness without roofs of unknown side, its own and those it lies next to."""
-    index, _ = neighbourhood.nearest(to.everything.neighbours, apply(T, from_.points), _REACH_M)
-    others = np.broadcast_to(other.side_is_unknown, len(other.xyz))[to.everything.index]
-    meets = (index >= 0) & others[np.maximum(index, 0)]
-    return replace(from_, weights=np.where(is_unknown | meets, 0.0, from_.weights))
+    Of a flight without ground the cloth takes the lower edges of its walls for it.
+    """
+    rise = np.abs(everything.normals @ cloud.up)
+    is_flat = cloud.planarity[everything.index] > _FLAT
+    is_level: Mask = cloud.is_ground[everything.index] & is_flat & (rise > _LEVEL)
+    return is_level
