@@ -1,5 +1,7 @@
 """SOR: the twin's and scipy's choice, exact sums, strays that do not blind it."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -77,6 +79,43 @@ def test_totals_are_exact_and_add_up(values, cut):
     if values:
         assert totals.mean == pytest.approx(np.mean(values))
         assert totals.deviation == pytest.approx(np.std(array.astype(float)), rel=1e-6, abs=1e-3)
+
+
+def thin_facade(seed=0, density=400.0, thinner=2.0):
+    """Return ground, a facade seen `thinner` times as far apart, and strays; the slices of each."""
+    rng = np.random.default_rng(seed)
+    held = int(400 * density)
+    ground = np.column_stack([rng.uniform(0, 20, (held, 2)), rng.normal(0, 0.01, held)])
+    count = int(200 * density / thinner**2)
+    facade = np.column_stack(
+        [rng.uniform(0, 20, count), 10 + rng.normal(0, 0.01, count), rng.uniform(0, 10, count)]
+    )
+    strays = rng.uniform([0, 0, 0.6], [20, 20, 14], (int(density / 4), 3))
+    parts = [ground, facade, strays]
+    ends = np.cumsum([0, *map(len, parts)])
+    return np.vstack(parts), [slice(a, b) for a, b in pairwise(ends)]
+
+
+@pytest.mark.parametrize(("density", "thinner"), [(25.0, 3.0), (100.0, 4.0), (400.0, 4.0)])
+def test_a_facade_that_is_thinner_than_the_ground_is_spared(density, thinner):
+    points, (_, facade, strays) = thin_facade(density=density, thinner=thinner)
+    plain = statistical(points)
+    spared = statistical(points, Statistical(spare_places=True))
+    assert plain.is_kept[facade].mean() < 0.5
+    assert spared.is_kept[facade].mean() > 0.9
+    assert spared.is_kept[strays].mean() < 0.1
+    assert not (plain.is_kept & ~spared.is_kept).any()
+    assert (spared.attributes["removal_margin"][~spared.is_kept] > 1).all()
+    assert (spared.attributes["removal_margin"][spared.is_kept] <= 1).all()
+    assert "stay (spare_places)" in spared.notes[-1]
+
+
+def test_where_no_place_goes_nothing_is_spared():
+    points, _ = thin_facade(thinner=1.0)
+    plain, spared = statistical(points), statistical(points, Statistical(spare_places=True))
+    assert not plain.is_kept.all()
+    np.testing.assert_array_equal(plain.is_kept, spared.is_kept)
+    assert spared.notes == plain.notes
 
 
 def test_either_a_number_or_a_radius():

@@ -95,6 +95,29 @@ def test_tiles_judge_as_the_whole(tmp_path, name, values, most):
         np.testing.assert_array_equal(found["height"], expected.attributes["height_above_ground"])
 
 
+@pytest.mark.parametrize("most", [2500, 10**9])
+def test_a_thin_facade_is_spared_on_tiles_as_in_the_whole(tmp_path, most):
+    rng = np.random.default_rng(7)
+    ground = np.column_stack([rng.uniform(0, 12, (15_000, 2)), rng.normal(0, 0.01, 15_000)])
+    facade = np.column_stack(
+        [rng.uniform(0, 12, 1300), 6 + rng.normal(0, 0.01, 1300), rng.uniform(0, 10, 1300)]
+    )
+    strays = rng.uniform([0, 0, 0.6], [12, 12, 14], (30, 3))
+    cloud, whole = tiled(np.vstack([ground, facade, strays]), tmp_path, most)
+    params = FILTERS["statistical"].params(spare_places=True)
+    expected = FILTERS["statistical"].verb(whole.xyz, params)
+    assert "spare_places" in expected.notes[-1]
+    with local_engine() as engine:
+        bench = TileBench(cloud, engine)
+        done = bench.apply("statistical", params)
+    found = states(bench, len(whole.xyz))
+    np.testing.assert_array_equal(found["code"] == Reason.KEPT, expected.is_kept)
+    assert of_filter(done.notes) == expected.notes
+    assert done.taken == int((~expected.is_kept).sum())
+    for detail, wanted in details_of(expected).items():
+        np.testing.assert_array_equal(found[detail], wanted)
+
+
 def things():
     """What no tile sees whole: wires, chains in pieces, clumps and a stele before a wall."""
     rng = np.random.default_rng(5)

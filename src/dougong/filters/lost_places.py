@@ -44,17 +44,7 @@ def lost_places(taken: Taken, asked: Taken, origin: NDArray[np.float64]) -> str 
     origin : ndarray, shape (3,)
         Of the local frame: places are told in the file's coordinates.
     """
-    parts = [_counted(points) for points in taken() if len(points)]
-    if not parts:
-        return None
-    cells, gone = summed_cells(*map(np.concatenate, zip(*parts, strict=True)))
-    is_crowded = gone > SHARE * LEAST_HELD
-    cells, gone = cells[is_crowded], gone[is_crowded]
-    if not len(gone):
-        return None
-    held = sum((_held(points, cells) for points in asked()), np.zeros(1, np.int64))
-    is_lost = (held >= LEAST_HELD) & (gone > SHARE * held)
-    cells, gone = cells[is_lost], gone[is_lost]
+    cells, gone = lost_cells(taken, asked)
     points = int(gone.sum())
     if points < LEAST_POINTS:
         return None
@@ -68,9 +58,25 @@ def lost_places(taken: Taken, asked: Taken, origin: NDArray[np.float64]) -> str 
     )
 
 
-def _counted(points: Points) -> tuple[Points, Index]:
+def lost_cells(taken: Taken, asked: Taken, edge_m: float = EDGE_M) -> tuple[Points, Index]:
+    """Return the cells (m, 3), in edges, that lost most of their points, and how many each lost."""
+    nothing = np.zeros((0, 3)), np.zeros(0, np.int64)
+    parts = [_counted(points, edge_m) for points in taken() if len(points)]
+    if not parts:
+        return nothing
+    cells, gone = summed_cells(*map(np.concatenate, zip(*parts, strict=True)))
+    is_crowded = gone > SHARE * LEAST_HELD
+    cells, gone = cells[is_crowded], gone[is_crowded]
+    if not len(gone):
+        return nothing
+    held = sum((_held(points, cells, edge_m) for points in asked()), np.zeros(1, np.int64))
+    is_lost = (held >= LEAST_HELD) & (gone > SHARE * held)
+    return cells[is_lost], gone[is_lost]
+
+
+def _counted(points: Points, edge_m: float) -> tuple[Points, Index]:
     """Return the cells of points (n, 3), n >= 1, each once, and how many points each has."""
-    cells = np.floor(points / EDGE_M)
+    cells = np.floor(points / edge_m)
     middle = np.median(cells, axis=0)
     cells = cells[(np.abs(cells - middle) < _SPAN / 2).all(axis=1)]
     if not len(cells):
@@ -78,9 +84,9 @@ def _counted(points: Points) -> tuple[Points, Index]:
     return summed_cells(cells, np.ones(len(cells), np.int64))
 
 
-def _held(points: Points, cells: Points) -> Index:
+def _held(points: Points, cells: Points, edge_m: float) -> Index:
     """Return how many of `points` (n, 3) each of the cells (m, 3), m >= 1, holds."""
-    at = np.floor(points / EDGE_M)
+    at = np.floor(points / edge_m)
     near = at[are_within(at, cells.min(axis=0), cells.max(axis=0))]
     # Each cell counts itself once.
     columns = np.concatenate([cells, near]).astype(np.int64).T

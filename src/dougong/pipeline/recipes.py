@@ -57,7 +57,8 @@ class LidarRecipe(SensorRecipe):
 class PhotogrammetryRecipe(SensorRecipe):
     """Filters of a drone cloud, in order."""
 
-    statistical: Statistical = Statistical()
+    statistical: Statistical = Statistical(spare_places=True)
+    """The published filter, except where it would take whole places (a thinly seen facade)."""
     low_outliers: LowOutliers = LowOutliers()
     cloth_simulation: ClothSimulation = ClothSimulation(class_threshold_m=0.15)
     """H = 0.15 m: 3 sigma of 1-3 cm noise plus the slope under half a cloth cell."""

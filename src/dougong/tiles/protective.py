@@ -6,6 +6,7 @@ things say of them, and whether they lie in rows.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dougong._boxes import are_within, corners_of
 from dougong.filters import protective
@@ -14,12 +15,13 @@ from dougong.filters.groups import sizes_of
 from dougong.filters.neighbourhood import build_index
 from dougong.filters.protective import Doubtful, row_halo_m, rows_excused
 from dougong.filters.selection import Reason
-from dougong.filters.statistical import nearest_distances
+from dougong.filters.statistical import nearest_distances, select_near, spare
 from dougong.filters.surroundings import HALO, SLACK, TESTS, Taken, test_part
 from dougong.tiles import things
 from dougong.tiles.cloud import POINTS, Arrays, Record, Tile, read_arrays, read_file
 from dougong.tiles.parts import Job, asked_of, cloud_of, with_halo
 from dougong.tiles.work import booked
+from dougong.typing import Values
 
 _FEW = tuple(f"few_{name}" for name in Doubtful._fields)
 
@@ -88,7 +90,36 @@ def judge(job: Job) -> tuple[Arrays, Record]:
     The second is None where there are too few points to judge any.
     """
     assert isinstance(job.params, CurvatureWeighted)
-    tested, judged, reach = job.known
+    margin, reason = _verdict(job, *job.known)
+    asked = asked_of(job.folder, job.tile, job.before, job.among)
+    is_judged = asked[asked_of(job.folder, job.tile, job.before, "left")]
+    counts = None
+    if job.params.solid_voxel_count is not None:
+        stored = read_arrays(job.folder, job.tile, POINTS, "voxel_count", if_there=True)
+        if stored:
+            counts = stored["voxel_count"][asked]
+    chosen = protective_choice(margin[is_judged], reason[is_judged], job.params, counts)
+    return booked(job, chosen, Reason.CURVATURE_WEIGHTED)
+
+
+def judge_spared(job: Job) -> tuple[Arrays, Record]:
+    """Take by `Statistical` only what is taken here too.
+
+    Known: the step of the mean distances and the cut, then as for `judge`.
+    """
+    means, cut, *found = job.known
+    chosen = select_near(read_arrays(job.folder, job.tile, means, "mean")["mean"], cut)
+    _, reason = _verdict(job, *found)
+    spared = spare(chosen, reason == Taken.KEPT)
+    arrays, record = booked(job, spared, Reason.STATISTICAL)
+    count = int((spared.is_kept & ~chosen.is_kept).sum())
+    return arrays, {**record, "spared": count}
+
+
+def _verdict(
+    job: Job, tested: str, judged: str | None, reach: float
+) -> tuple[Values, NDArray[np.uint8]]:
+    """Return margin and reason (n,) of every point of the tile that is left."""
     found = read_arrays(job.folder, job.tile, tested, "margin", "few_place")
     margin = found["margin"]
     reason = np.full(len(margin), Taken.KEPT, np.uint8)
@@ -99,15 +130,7 @@ def judge(job: Job) -> tuple[Arrays, Record]:
         place = found["few_place"]
         margin[place], reason[place] = rows_excused(few, own, reach), few.reason[:own]
         reason[margin <= 1.0] = Taken.KEPT
-    asked = asked_of(job.folder, job.tile, job.before, job.among)
-    is_judged = asked[asked_of(job.folder, job.tile, job.before, "left")]
-    counts = None
-    if job.params.solid_voxel_count is not None:
-        stored = read_arrays(job.folder, job.tile, POINTS, "voxel_count", if_there=True)
-        if stored:
-            counts = stored["voxel_count"][asked]
-    chosen = protective_choice(margin[is_judged], reason[is_judged], job.params, counts)
-    return booked(job, chosen, Reason.CURVATURE_WEIGHTED)
+    return margin, reason
 
 
 def _with_rows(job: Job, tested: str, judged: str, reach_m: float) -> tuple[Doubtful, int]:

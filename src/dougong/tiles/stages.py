@@ -27,7 +27,14 @@ from dougong.filters.protective import is_too_few
 from dougong.filters.radius import Radius
 from dougong.filters.ranks import ValueBlocks, count_finite, median
 from dougong.filters.selection import NOISE, Reason
-from dougong.filters.statistical import Statistical, cut_distance, stray_notes
+from dougong.filters.statistical import (
+    Statistical,
+    cut_distance,
+    spared_notes,
+    sparing_reach,
+    stray_notes,
+    takes_places,
+)
 from dougong.filters.surroundings import REACH_M, TESTS, reach_of
 from dougong.filters.totals import Totals
 from dougong.filters.wires import are_rows
@@ -164,17 +171,18 @@ class _Stage:
 
     def lost_places(self, after: str) -> tuple[str, ...]:
         """Return what is to be said where this stage, which left the state `after`, took places."""
-
-        def taken() -> Iterator[Points]:
-            folder = self.cloud.folder
-            for tile in self.cloud.tiles:
-                code = read_arrays(folder, tile, after, "code")["code"]
-                is_taken = self.mask(tile) & (code != Reason.KEPT)
-                if is_taken.any():
-                    yield read_arrays(folder, tile, POINTS, "xyz")["xyz"][is_taken]
-
-        note = lost_places(taken, self.blocks, np.array(self.cloud.facts["origin"]))
+        origin = np.array(self.cloud.facts["origin"])
+        note = lost_places(partial(self.taken, after), self.blocks, origin)
         return () if note is None else (note,)
+
+    def taken(self, after: str) -> Iterator[Points]:
+        """Yield the points that this stage, which left the state `after`, took, tile by tile."""
+        folder = self.cloud.folder
+        for tile in self.cloud.tiles:
+            code = read_arrays(folder, tile, after, "code")["code"]
+            is_taken = self.mask(tile) & (code != Reason.KEPT)
+            if is_taken.any():
+                yield read_arrays(folder, tile, POINTS, "xyz")["xyz"][is_taken]
 
     def values(self, stage: str, name: str) -> ValueBlocks:
         """Return the blocks of an array of an earlier step."""
@@ -260,7 +268,15 @@ def _statistical(stage: _Stage) -> Outcome:
         _, means = stage.map("nearest", nearest.nearest, stage.params.neighbours)
     cut, strays = cut_distance(stage.values(means, "mean"), stage.params.multiplier)
     records, key = stage.map("statistical", work.judge_statistical, (means, cut))
-    return records, stray_notes(strays), key
+    notes = stray_notes(strays)
+    taken = partial(stage.taken, key)
+    if not stage.params.spare_places or not takes_places(taken, stage.blocks, cut):
+        return records, notes, key
+    beyond = _sum(records, "taken")
+    rule = CurvatureWeighted(reach_m=sparing_reach(cut))
+    found = _protective_found(replace(stage, params=rule))
+    records, key = stage.map("spared", protective.judge_spared, (means, cut, *found))
+    return records, (*notes, *spared_notes(_sum(records, "spared"), beyond)), key
 
 
 def _pass_through(stage: _Stage) -> Outcome:
@@ -281,7 +297,7 @@ def _heights(stage: _Stage) -> Any:
 def _curvature_weighted(stage: _Stage) -> Outcome:
     assert isinstance(stage.params, CurvatureWeighted)
     if stage.params.rule == "protective":
-        return _protective(stage, stage.params)
+        return _protective(stage)
     known = None
     if stage.params.rule == "global":
         counted, _ = stage.map("totals", work.count_curvature)
@@ -291,18 +307,24 @@ def _curvature_weighted(stage: _Stage) -> Outcome:
     return records, (), key
 
 
-def _protective(stage: _Stage, params: CurvatureWeighted) -> Outcome:
+def _protective(stage: _Stage) -> Outcome:
     # What is not judged, the ground, is seen: without it a gravestone hovers.
-    seen = stage.of_all_left()
-    reach, eighth = _reach(seen, params)
+    known = _protective_found(stage.of_all_left())
+    records, key = stage.map("curvature_weighted", protective.judge, known)
+    note = _concentration(stage, known[0], key) if stage.asked else None
+    return records, () if note is None else (note,), key
+
+
+def _protective_found(seen: _Stage) -> tuple[str, str | None, float]:
+    """Return the steps of the tests and of `hovering` of all that is seen, and the reach."""
+    assert isinstance(seen.params, CurvatureWeighted)
+    reach_m = seen.params.reach_m
+    reach, eighth = _reach(seen, seen.params)
     _, tested = seen.map("surroundings", protective.test_points, (eighth, reach))
     judged = None
-    if not is_too_few(seen.asked, params.reach_m):
-        judged = _hovering(seen, tested, reach, is_whole=params.reach_m is None)
-    known = (tested, judged, reach)
-    records, key = stage.map("curvature_weighted", protective.judge, known)
-    note = _concentration(stage, tested, key) if stage.asked else None
-    return records, () if note is None else (note,), key
+    if not is_too_few(seen.asked, reach_m):
+        judged = _hovering(seen, tested, reach, is_whole=reach_m is None)
+    return tested, judged, reach
 
 
 def _hovering(stage: _Stage, tested: str, reach: float, *, is_whole: bool) -> str:
