@@ -8,9 +8,11 @@ from hypothesis import strategies as st
 from dougong.cloud import Cloud
 from dougong.errors import OutputError, TileError
 from dougong.filters import FILTERS
+from dougong.filters.neighbourhood import build_index
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid
 from dougong.filters.radius import Radius
 from dougong.filters.selection import Reason, details_of
+from dougong.filters.statistical import nearest_distances
 from dougong.tiles import nearest, work
 from dougong.tiles.cloud import load_tiles, read_arrays, read_file
 from dougong.tiles.engine import Task, local_engine
@@ -214,6 +216,27 @@ def test_a_tile_of_few_points_does_not_read_the_site(tmp_path, monkeypatch):
     expected = FILTERS["statistical"].verb(whole.xyz, params)
     found = states(bench, len(points))["code"] == Reason.KEPT
     np.testing.assert_array_equal(found, expected.is_kept)
+
+
+@settings(max_examples=6, deadline=None, phases=[Phase.generate])
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1, 6, 20, 90]), st.sampled_from([1, 5, 64]))
+def test_strays_find_their_nearest_in_other_tiles(tmp_path_factory, seed, k, few):
+    rng = np.random.default_rng(seed)
+    strays = rng.normal([0, 0, 0], rng.choice([1, 8, 60], (200, 1)), (200, 3))
+    points = np.vstack([site(seed, 1500), strays, strays[:60], strays[:60]])
+    cloud, whole = tiled(np.round(points, 3), tmp_path_factory.mktemp("tiles"), 700)
+    params = FILTERS["statistical"].params(neighbours=k)
+    wanted, _ = nearest_distances(build_index(whole.xyz), k, len(whole.xyz))
+    unsure = 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(nearest, "_FEW", few)
+        for tile in cloud.tiles:
+            job = Job(cloud.folder, tile, "", params, asked=len(points), known=k)
+            found, record = nearest.nearest(job)
+            row = read_arrays(cloud.folder, tile, "points", "row")["row"]
+            np.testing.assert_array_equal(found["mean"], wanted[row])
+            unsure += record["unsure"]
+    assert unsure > 20
 
 
 RECIPE = [

@@ -3,9 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong._boxes import are_within, corners_of
+from dougong.filters.clusters import distance_to
 from dougong.filters.neighbourhood import Neighbourhood, build_index, knn
 from dougong.filters.statistical import mean_and_largest, nearest_distances
+from dougong.filters.surroundings import SLACK
 from dougong.tiles.cloud import Arrays, Record, Tile
 from dougong.tiles.parts import Job, asked_points, cloud_of, in_box, with_halo
 from dougong.typing import Points, Values
@@ -13,6 +14,8 @@ from dougong.typing import Points, Values
 _WIDEST = 0.25
 """A halo is at most this share of the tile's longest side: a tile of a few points high above a roof
 does not read half a site for them."""
+_FEW = 64
+"""Of every so many points one is asked first how far it is worth to look."""
 
 
 def nearest(job: Job) -> tuple[Arrays, Record]:
@@ -50,11 +53,12 @@ def _nearest_of_all(
         if not len(rows):
             continue
         points = asked_points(job, others[number])
-        points = _about(points, queries[rows], float(nearest_m[rows, -1].max()))
-        points = points[~in_box(points, job.tile, halo_m)]
-        for some in _of_like_reach(nearest_m[rows, -1]):
+        reach_m = _reach_of_few(job, points, queries[rows], halo_m, k)
+        reach_m = np.minimum(reach_m, nearest_m[rows, -1])
+        for some in _of_like_reach(reach_m):
             asked = rows[some]
-            near = _about(points, queries[asked], float(nearest_m[asked, -1].max()))
+            near = _within_reach(points, queries[asked], float(reach_m[some].max()))
+            near = near[~in_box(near, job.tile, halo_m)]
             if len(near):
                 more = knn(build_index(near), queries[asked], k)[1]
                 both = np.concatenate([nearest_m[asked], more], axis=1)
@@ -72,10 +76,22 @@ def _of_like_reach(reach_m: Values) -> list[NDArray[np.int64]]:
     return [np.flatnonzero(octave == one) for one in np.unique(octave)]
 
 
-def _about(points: Points, queries: Points, reach_m: float) -> Points:
-    """Return the points within `reach_m` of the box of the queries."""
-    low, high = corners_of(queries)
-    return points[are_within(points, low - reach_m, high + reach_m)]
+def _reach_of_few(job: Job, points: Points, queries: Points, halo_m: float, k: int) -> Values:
+    """Return how far the k-th nearest (m,) is among a few of the points outside the halo.
+
+    Among all of them it is no farther, so a stray looks at little of a tile far below it.
+    """
+    few = points[::_FEW]
+    few = few[~in_box(few, job.tile, halo_m)]
+    reach_m: Values = knn(build_index(few), queries, k)[1][:, -1]
+    return reach_m
+
+
+def _within_reach(points: Points, queries: Points, reach_m: float) -> Points:
+    """Return the points within `reach_m` of any query, of which there are far fewer."""
+    limit = reach_m * SLACK
+    gap_m = distance_to(build_index(queries), np.ones(len(queries), bool), points, limit)
+    return points[gap_m < limit]
 
 
 def _gap(points: Points, tile: Tile) -> Values:
