@@ -210,3 +210,19 @@ def test_leaves_that_reach_far_and_heaps_find_the_same_neighbours(k, limit_m):
     wanted = cKDTree(points).query(points, k + 1)[0][:, 1:]
     wanted[wanted > limit_m] = np.inf
     np.testing.assert_allclose(distance, wanted, rtol=1e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(2, 400), st.integers(1, 40), st.integers(2, 40))
+def test_ties_among_the_points_themselves_are_ranked_by_content(seed, n, k, wide):
+    rng = np.random.default_rng(seed)
+    points = rng.integers(0, wide, (n, 3)).astype(float)
+    # Copies are told apart by their place only.
+    points[: n // 8] = points[-1]
+    place, _ = nb.knn(nb.build_index(points), None, k)
+    for i, row in enumerate(place):
+        others = np.delete(points, i, axis=0)
+        best = np.lexsort((*others.T[::-1], ((others - points[i]) ** 2).sum(1)))[:k]
+        found = row[row >= 0]
+        assert len(set(found.tolist()) - {i}) == len(found)
+        np.testing.assert_array_equal(points[found], others[best])
