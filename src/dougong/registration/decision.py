@@ -93,9 +93,9 @@ def decide(
             "the coarse search found no pose at which the two clouds have anything in common."
         )
     poses = [h.T_target_source for h in starts]
-    heard = _hear((source, target), poses, params, control, clock)
-    heard = _without_roofs_in_doubt(heard, poses, params, control, clock)
-    answer = _doubted(heard, params, clock)
+    whole = _hear((source, target), poses, params, control, clock)
+    heard = _without_roofs_in_doubt(whole, poses, params, control, clock)
+    answer = _doubted(heard, whole, params, clock)
     if answer is None:
         return refused(LEFT_SENTENCE)
     status, reason, evidence = answer
@@ -205,8 +205,13 @@ def _ground_says(heard: _Heard, T: Transform) -> Literal["agrees", "differs", "n
     return ground_says(heard.court, heard.source, heard.target, T)
 
 
-def _doubted(heard: _Heard, params: Register, clock: Laps) -> tuple[Status, str, Evidence] | None:
-    """Return status, reason and evidence after every doubt was heard; None: it is left-handed."""
+def _doubted(
+    heard: _Heard, whole: _Heard, params: Register, clock: Laps
+) -> tuple[Status, str, Evidence] | None:
+    """Return status, reason and evidence after every doubt was heard; None: it is left-handed.
+
+    `whole` is what both clouds said with all their points: marks of the place are among them.
+    """
     status, reason, evidence = heard.status, heard.reason, _evidence(heard.ruling, heard.spread_m)
     if reason == UNHELD:
         # The other side of the roof is one more pose that fits as well.
@@ -219,7 +224,8 @@ def _doubted(heard: _Heard, params: Register, clock: Laps) -> tuple[Status, str,
         if pulled is not None:
             (status, reason), evidence = pulled, replace(evidence, spread_m=np.inf)
     if status == "ok":
-        alike = look_alike_doubt(court, source, target, ruling, params.verdict)
+        clouds = whole.court, whole.source, whole.target
+        alike = look_alike_doubt(*clouds, ruling, params.verdict)
         if alike is not None:
             status, reason, evidence = "ambiguous", alike, _with_one_more(evidence)
     if status == "ok" and fine is not None:
