@@ -9,11 +9,10 @@ from typing import Literal
 import numpy as np
 
 from dougong.registration import hypotheses as ranking
-from dougong.registration.control import Adjusted, Control, adjust, weigh_control
-from dougong.registration.covariance import displacement95
-from dougong.registration.evidence import Court, hear, summon
+from dougong.registration.control import Adjusted, Control, weigh_control
 from dougong.registration.handedness import LEFT_SENTENCE, OPEN_SENTENCE, handedness
-from dougong.registration.icp import Icp, Level, build_levels, refine
+from dougong.registration.hearing import Heard, hear_pair, icp_of, is_near_hint, yaw_deg
+from dougong.registration.icp import refine
 from dougong.registration.laps import Laps
 from dougong.registration.look_alikes import look_alike_doubt
 from dougong.registration.overlap import apply
@@ -23,15 +22,15 @@ from dougong.registration.result import FineResult, Hypothesis, Status
 from dougong.registration.rivals import is_near, is_same, middle_of
 from dougong.registration.roof_sides import (
     LEFT_OUT,
-    UNHELD,
     are_roofs_unsure,
     ground_says,
+    height_left_open,
+    unheld,
     without_unsure_roofs,
 )
 from dougong.registration.scale_check import size_doubt
 from dougong.registration.settings import Register
-from dougong.registration.told_by_ground import told_by_ground
-from dougong.registration.verdict import Ruling, rule, status_of
+from dougong.registration.verdict import Ruling
 from dougong.typing import Transform
 
 _LISTED = 12
@@ -55,29 +54,6 @@ class Found:
     """With the control points; None: there are none, or they changed nothing."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Heard:
-    """The best pose of a pair and what the proof says of it, before it is doubted."""
-
-    source: Prepared
-    target: Prepared
-    court: Court
-    levels: tuple[Level, ...]
-    quick: Icp
-    ruling: Ruling
-    fine: FineResult | None
-    adjusted: Adjusted | None
-    status: Status
-    reason: str
-    spread_m: float
-    """How closely the blocks hold the pose, metres; inf: unknown."""
-
-    @property
-    def T(self) -> Transform:
-        """Return the pose (source -> target), as exact as it is known."""
-        return self.ruling.winner.T if self.fine is None else self.fine.T_target_source
-
-
 def decide(
     source: Prepared,
     target: Prepared,
@@ -93,7 +69,7 @@ def decide(
             "the coarse search found no pose at which the two clouds have anything in common."
         )
     poses = [h.T_target_source for h in starts]
-    whole = _hear((source, target), poses, params, control, clock)
+    whole = hear_pair((source, target), poses, params, control, clock)
     heard = _without_roofs_in_doubt(whole, poses, params, control, clock)
     answer = _doubted(heard, whole, params, clock)
     if answer is None:
@@ -116,51 +92,13 @@ def decide(
     )
 
 
-def _hear(
-    clouds: tuple[Prepared, Prepared],
-    poses: Sequence[Transform],
-    params: Register,
-    control: Control | None,
-    clock: Laps,
-) -> _Heard:
-    """Return the best of what the poses lead to, fitted exactly, and whether it is proven."""
-    court, quick = summon(*clouds), _quick(_icp(params), *clouds)
-    levels = build_levels(*clouds, quick)
-    ruling = rule(
-        court,
-        levels,
-        poses,
-        quick,
-        params.verdict,
-        lambda T: _is_near_hint(T, params) and (control is None or control.allows(T)),
-    )
-    ruling = told_by_ground(court, clouds, levels, ruling, quick, params.verdict)
-    clock.lap("proof")
-    fine, adjusted = _refined(*clouds, ruling, params, control)
-    clock.lap("fine")
-    status, reason, spread = _judged(court, ruling, fine, params)
-    return _Heard(
-        source=clouds[0],
-        target=clouds[1],
-        court=court,
-        levels=levels,
-        quick=quick,
-        ruling=ruling,
-        fine=fine,
-        adjusted=adjusted,
-        status=status,
-        reason=reason,
-        spread_m=spread,
-    )
-
-
 def _without_roofs_in_doubt(
-    heard: _Heard,
+    heard: Heard,
     poses: Sequence[Transform],
     params: Register,
     control: Control | None,
     clock: Laps,
-) -> _Heard:
+) -> Heard:
     """Return what a pair says without roofs of unknown side, if they may hold its height wrongly.
 
     What was heard with them stays where the ground or control points hold the height, where turns
@@ -174,46 +112,54 @@ def _without_roofs_in_doubt(
     if is_turned or _ground_says(heard, heard.T) == "agrees":
         return heard
     rest = _rest(heard, poses, params, control, clock)
-    if rest is None or _ground_says(heard, rest.T) == "differs":
-        return replace(heard, status="ambiguous", reason=UNHELD) if heard.status == "ok" else heard
-    apart = np.linalg.norm(apply(rest.T, at[None]) - apply(heard.T, at[None]))
-    if heard.status == "ok" and apart <= params.verdict.most_spread_m:
+    if rest is not None:
+        apart = np.linalg.norm(apply(rest.T, at[None]) - apply(heard.T, at[None]))
+        if heard.status == "ok" and apart <= params.verdict.most_spread_m:
+            return heard
+        if _ground_says(heard, rest.T) != "differs":
+            return replace(rest, reason=rest.reason + LEFT_OUT)
+    if heard.status != "ok":
         return heard
-    return replace(rest, reason=rest.reason + LEFT_OUT)
+    left_open = height_left_open(heard.court, heard.source, heard.target, heard.T)
+    if left_open is None:
+        return heard
+    return replace(heard, status="ambiguous", reason=unheld(left_open), is_height_open=True)
 
 
 def _rest(
-    heard: _Heard,
+    heard: Heard,
     poses: Sequence[Transform],
     params: Register,
     control: Control | None,
     clock: Laps,
-) -> _Heard | None:
+) -> Heard | None:
     """Return what is proven without roofs of unknown side; None: nothing is."""
     T, rest = heard.T, None
     # What lies near a roof under a pose that is a roof's thickness off is asked once more.
     for _ in range(2):
         without = without_unsure_roofs(heard.source, heard.target, T)
-        rest = None if without is None else _hear(without, [T, *poses], params, control, clock)
-        if rest is None or rest.status != "ok":
+        if without is None:
+            return None
+        rest = hear_pair(without, [T, *poses], params, control, clock, seen_through=heard.court)
+        if rest.status != "ok":
             return None
         T = rest.T
     return rest
 
 
-def _ground_says(heard: _Heard, T: Transform) -> Literal["agrees", "differs", "nothing"]:
+def _ground_says(heard: Heard, T: Transform) -> Literal["agrees", "differs", "nothing"]:
     return ground_says(heard.court, heard.source, heard.target, T)
 
 
 def _doubted(
-    heard: _Heard, whole: _Heard, params: Register, clock: Laps
+    heard: Heard, whole: Heard, params: Register, clock: Laps
 ) -> tuple[Status, str, Evidence] | None:
     """Return status, reason and evidence after every doubt was heard; None: it is left-handed.
 
     `whole` is what both clouds said with all their points: marks of the place are among them.
     """
     status, reason, evidence = heard.status, heard.reason, _evidence(heard.ruling, heard.spread_m)
-    if reason == UNHELD:
+    if heard.is_height_open:
         # The other side of the roof is one more pose that fits as well.
         evidence = _with_one_more(evidence)
     source, target, court, ruling, fine = (
@@ -229,7 +175,7 @@ def _doubted(
         if alike is not None:
             status, reason, evidence = "ambiguous", alike, _with_one_more(evidence)
     if status == "ok" and fine is not None:
-        doubt = size_doubt(source, target, heard.T, _icp(params), params.verdict.most_spread_m)
+        doubt = size_doubt(source, target, heard.T, icp_of(params), params.verdict.most_spread_m)
         if doubt is not None:
             (reason, moved), status = doubt, "ambiguous"
             evidence = replace(evidence, spread_m=moved)
@@ -241,7 +187,7 @@ def _doubted(
             status, reason, evidence = "ambiguous", OPEN_SENTENCE, _with_one_more(evidence)
         reason += " Its mirror image fits as well." if hand == "unknown" else ""
         clock.lap("mirror check")
-    if status == "ok" and not _is_near_hint(heard.T, params):
+    if status == "ok" and not is_near_hint(heard.T, params):
         status, reason = "ambiguous", _off_hint(heard.T, params)
     return status, reason, evidence
 
@@ -269,26 +215,6 @@ def _probability(status: str, ruling: Ruling, evidence: Evidence) -> float:
     return BELIEF.probability(evidence)
 
 
-def _icp(params: Register) -> Icp:
-    method = {} if params.fine == "none" else {"method": params.fine}
-    return params.icp.model_copy(update={"dof": 4 if params.dof == 4 else 6, **method})
-
-
-def _refined(
-    source: Prepared, target: Prepared, ruling: Ruling, params: Register, control: Control | None
-) -> tuple[FineResult | None, Adjusted | None]:
-    """Return the exact fit at the winning pose, adjusted with the control points if there are any.
-
-    None, None: what the proof has refused needs no exact pose.
-    """
-    if params.fine == "none" or status_of(ruling, None, params.verdict)[0] == "failed":
-        return None, None
-    icp = _icp(params)
-    fine = refine(source, target, ruling.winner.T, icp)
-    adjusted = None if control is None else adjust(fine, control, icp.dof)
-    return (fine if adjusted is None else adjusted.fine), adjusted
-
-
 def _weigh_points(
     source: Prepared, target: Prepared, ruling: Ruling, fine: FineResult, params: Register
 ) -> tuple[Literal["ambiguous"], str] | None:
@@ -297,7 +223,7 @@ def _weigh_points(
     Points that lie farther apart than the clouds are rough pull their pose towards themselves: two
     samplings of one surface then meet decimetres off, each block agreeing. None: they do meet.
     """
-    icp = _icp(params).model_copy(update={"method": "point-to-plane"})
+    icp = icp_of(params).model_copy(update={"method": "point-to-plane"})
     plane = refine(source, target, ruling.winner.T, icp).T_target_source
     off = apply(plane, source.xyz) - apply(fine.T_target_source, source.xyz)
     apart = float(np.quantile(np.linalg.norm(off, axis=1), 0.95))
@@ -326,78 +252,13 @@ def refused(reason: str) -> Found:
     )
 
 
-def _quick(icp: Icp, source: Prepared, target: Prepared) -> Icp:
-    """Return settings for bringing every hypothesis to its place: wide bounds, few points."""
-    spacing = max(source.spacing_m, target.spacing_m)
-    return icp.model_copy(
-        update={
-            "method": "point-to-plane",
-            "levels": 3,
-            "first_distance_m": max(1.5, 12.0 * spacing),
-            "last_distance_m": max(0.25, 3.0 * spacing),
-            "points_per_level": min(4000, icp.points_per_level),
-            "tolerance_m": 5e-4,
-            "max_iterations": 20,
-        }
-    )
-
-
-def _judged(
-    court: Court, ruling: Ruling, fine: FineResult | None, params: Register
-) -> tuple[Literal["ok", "ambiguous", "failed"], str, float]:
-    """Return status, reason, and how closely the blocks hold the pose, metres (inf: unknown)."""
-    status, reason = status_of(ruling, fine, params.verdict)
-    if fine is None or status == "failed":
-        return status, reason, np.inf
-    final = hear(court, fine.T_target_source)
-    if not is_same(final.T, ruling.winner.T, middle_of(court.source.points)):
-        why = (
-            "the fine fit left the pose that was judged best: the surface near it holds it "
-            "too weakly. Control points or more overlap would decide."
-        )
-        return "ambiguous", why, np.inf
-    if fine.covariance is None:
-        return status, reason, np.inf
-    explained = final.is_explained[: len(court.source.points)]
-    spread = displacement95(
-        fine.covariance,
-        fine.covariance_about,
-        apply(final.T, court.source.points[explained]),
-        fine.covariance_blocks,
-        fine.covariance_widening,
-        fine.covariance_of_control,
-    )
-    if status != "ok":
-        return status, reason, spread
-    limit = params.verdict.most_spread_m
-    if spread > limit:
-        why = (
-            f"the parts of the shared surface disagree about the pose by {spread:.2g} m "
-            f"(95 %; at most {limit:.2g} m expected): it is held too weakly, or one cloud is "
-            "bent. Control points or more overlap would decide."
-        )
-        return "ambiguous", why, spread
-    agree = f"The parts of the shared surface agree about it to {1e3 * spread:.0f} mm (95 %)."
-    return status, f"{reason} {agree}", spread
-
-
-def _is_near_hint(T: Transform, params: Register) -> bool:
-    """Say whether a pose is turned as the yaw hint says; any is where there is none."""
-    hint, reach = params.yaw_hint_deg, params.plan.yaw_hint_range_deg
-    return hint is None or abs((_yaw_deg(T) - hint + 180.0) % 360.0 - 180.0) <= reach
-
-
 def _off_hint(T: Transform, params: Register) -> str:
     """Return what is to be said where no pose near the hint was left to be heard."""
     return (
-        f"the clouds fit at a yaw of {_yaw_deg(T):.0f} deg, and the hint says "
+        f"the clouds fit at a yaw of {yaw_deg(T):.0f} deg, and the hint says "
         f"{params.yaw_hint_deg:g}, within {params.plan.yaw_hint_range_deg:g}: nothing fits there. "
         "Check the hint, or register without it."
     )
-
-
-def _yaw_deg(T: Transform) -> float:
-    return float(np.degrees(np.arctan2(T[1, 0], T[0, 0])))
 
 
 def _listed(

@@ -3,13 +3,15 @@
 A scan without its stations shows a roof, and nothing beneath it: a roof that was seen from a tower,
 or a soffit over a closed room. The drone shows the top. Both readings fit, apart by the roof's
 thickness, and every block of the building agrees about the wrong one. Ground that both clouds show
-decides: no instrument sees it from below. Where it is missing, the pair is heard without such roofs
-and what lies on them: battered walls, sills, ledges and bases hold the height within millimetres
-where there are some, and say that they do not where there are none.
+decides: no instrument sees it from below. Where it is missing, the pair is heard by the inside of
+all other surfaces (`without_unsure_roofs`): battered walls, plinths and buttresses hold the height
+within millimetres where there are some. Where these prove no pose by themselves, the pose is held
+against itself, raised and lowered, by all that is no such roof (`height_left_open`).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -17,11 +19,13 @@ import numpy as np
 from dougong.filters import neighbourhood
 from dougong.filters.neighbourhood import build_index
 from dougong.registration.covariance import blocks_of
-from dougong.registration.evidence import Court
+from dougong.registration.evidence import Court, Witness, hear
 from dougong.registration.overlap import Rung, apply, inverse
 from dougong.registration.prepare import MIN_POINTS, Prepared
 from dougong.typing import Mask, Points, Transform, Values
 
+_HEIGHTS_M = (0.15, -0.15, 0.25, -0.25, 0.4, -0.4)
+"""How thick roofs are."""
 _REACH_M = 0.7
 _FLAT, _LEVEL = 0.7, 0.9
 """Planarity, and the rise of the normal, of ground that tells a height."""
@@ -37,11 +41,6 @@ _AGREES_M = 0.05
 
 LEFT_OUT = (
     " Roofs of which nobody knows the side were left out: all else holds the height without them."
-)
-UNHELD = (
-    "the height rests on roofs of which nobody knows whether they were seen from above or from "
-    "below, and nothing else holds it. Give the scan with its stations (E57, PTX), ground in both "
-    "clouds, or a control point."
 )
 
 
@@ -98,6 +97,69 @@ def _is_off_roofs(cloud: Prepared, other: Prepared, T: Transform) -> Mask:
             near, _ = neighbourhood.nearest(build_index(roofs), points, _REACH_M)
             is_off &= near < 0
     return is_off
+
+
+def height_left_open(
+    court: Court, source: Prepared, target: Prepared, T: Transform
+) -> float | None:
+    """Return a change of height that only roofs of unknown side speak against.
+
+    All else need not prove the height, which the fit has done: it must not prefer another one.
+    Without ground the ledges that speak are few, and a fit to the wrong side of a roof is seen by
+    their preferring its thickness back.
+
+    Parameters
+    ----------
+    court : Court
+        Of `source` and `target`.
+    T : ndarray, shape (4, 4)
+        The pose that is judged, local frames.
+
+    Returns
+    -------
+    float or None
+        Metres along the vertical; None where all else prefers `T`.
+    """
+    unknown = (_is_unknown(source, court.source), _is_unknown(target, court.target))
+    kept = replace(
+        court,
+        source=_silenced(court.source, court.target, T, unknown[0], target),
+        target=_silenced(court.target, court.source, inverse(T), unknown[1], source),
+    )
+    loss = hear(kept, T).total
+    for height in _HEIGHTS_M:
+        raised = T.copy()
+        raised[:3, 3] += height * target.up
+        if hear(kept, raised).total <= loss:
+            return height
+    return None
+
+
+def unheld(left_open_m: float) -> str:
+    """Return what is said of a pose that is proven but for its height."""
+    way = "higher" if left_open_m > 0.0 else "lower"
+    return (
+        "the height rests on roofs of which nobody knows whether they were seen from above or from "
+        f"below: all else fits {abs(left_open_m):.2g} m {way} as well. Give the scan with its "
+        "stations (E57, PTX), ground in both clouds, or a control point."
+    )
+
+
+def _is_unknown(cloud: Prepared, witness: Witness) -> Mask:
+    """Say which heard points are of a roof of unknown side."""
+    heard = witness.everything.index[witness.everything.asked]
+    is_unknown: Mask = np.broadcast_to(cloud.side_is_unknown, len(cloud.xyz))[heard]
+    return is_unknown
+
+
+def _silenced(
+    from_: Witness, to: Witness, T: Transform, is_unknown: Mask, other: Prepared
+) -> Witness:
+    """Return the witness without roofs of unknown side, its own and those it lies next to."""
+    index, _ = neighbourhood.nearest(to.everything.neighbours, apply(T, from_.points), _REACH_M)
+    others = np.broadcast_to(other.side_is_unknown, len(other.xyz))[to.everything.index]
+    meets = (index >= 0) & others[np.maximum(index, 0)]
+    return replace(from_, weights=np.where(is_unknown | meets, 0.0, from_.weights))
 
 
 def ground_says(
