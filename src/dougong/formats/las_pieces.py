@@ -96,9 +96,12 @@ class _Survey:
     def _look_at_times(self, piece: Cloud) -> None:
         for name in piece.attributes:
             values = piece.attribute(name) if canonical(name) == "gps_time" else None
-            if values is None or values.dtype.kind != "f" or not values.any():
+            if values is None or values.dtype.kind != "f":
                 continue
-            latest = float(np.fmax.reduce(values, initial=-np.inf))
+            known = values[np.isfinite(values)]
+            if not known.any():
+                continue
+            latest = float(known.max())
             self.last_time = latest if self.last_time is None else max(self.last_time, latest)
 
 
