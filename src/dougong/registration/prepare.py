@@ -120,6 +120,12 @@ class Prepared:
         """Return the vertical (3,) to search with: z, or what the walls proved."""
         return self.levelling.up if self.is_relevelled else np.array([0.0, 0.0, 1.0])
 
+    @property
+    def is_unsure_roof(self) -> Mask:
+        """Return `side_is_unknown` (n,) of every point."""
+        is_unsure: Mask = np.broadcast_to(self.side_is_unknown, len(self.xyz))
+        return is_unsure
+
     def chosen(self, is_chosen: Mask) -> "Prepared":
         """Return the cloud with the chosen (n,) of its points only."""
         per_point: dict[str, Any] = {

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -27,6 +28,8 @@ from dougong.typing import Mask, Points, Transform, Values
 _HEIGHTS_M = (0.15, -0.15, 0.25, -0.25, 0.4, -0.4)
 """How thick roofs are."""
 _REACH_M = 0.7
+_staying: WeakKeyDictionary[Prepared, Mask] = WeakKeyDictionary()
+"""What may stay of a cloud under any pose: a pair is asked twice."""
 _FLAT, _LEVEL = 0.7, 0.9
 """Planarity, and the rise of the normal, of ground that tells a height."""
 _NEIGHBOURS = 16
@@ -46,9 +49,8 @@ LEFT_OUT = (
 
 def are_roofs_unsure(source: Prepared, target: Prepared) -> bool:
     """Say whether two clouds may show the two sides of one roof, and nothing tells which."""
-    return source.kind != target.kind and bool(
-        np.any(source.side_is_unknown) or np.any(target.side_is_unknown)
-    )
+    are_there = source.is_unsure_roof.any() or target.is_unsure_roof.any()
+    return source.kind != target.kind and bool(are_there)
 
 
 def without_unsure_roofs(
@@ -70,11 +72,18 @@ def without_unsure_roofs(
     tuple of Prepared, or None
         None where too little is left.
     """
-    of_source = _is_inside(source) & _is_off_roofs(source, target, T)
-    of_target = _is_inside(target) & _is_off_roofs(target, source, inverse(T))
+    of_source = _may_stay(source) & _is_off(target, apply(T, source.xyz))
+    of_target = _may_stay(target) & _is_off(source, apply(inverse(T), target.xyz))
     if min(int(of_source.sum()), int(of_target.sum())) < MIN_POINTS:
         return None
     return source.chosen(of_source), target.chosen(of_target)
+
+
+def _may_stay(cloud: Prepared) -> Mask:
+    """Return which points (n,) lie inside a surface and off the cloud's own roofs in doubt."""
+    if cloud not in _staying:
+        _staying[cloud] = _is_inside(cloud) & _is_off(cloud, cloud.xyz)
+    return _staying[cloud]
 
 
 def _is_inside(cloud: Prepared) -> Mask:
@@ -85,17 +94,13 @@ def _is_inside(cloud: Prepared) -> Mask:
     return is_inside
 
 
-def _is_off_roofs(cloud: Prepared, other: Prepared, T: Transform) -> Mask:
-    """Return which points (n,) are near no roof of unknown side, the cloud's own nor the other's.
-
-    T : (4, 4) from the cloud to the other.
-    """
-    is_off = np.ones(len(cloud.xyz), bool)
-    for one, points in ((cloud, cloud.xyz), (other, apply(T, cloud.xyz))):
-        roofs = one.xyz[np.broadcast_to(one.side_is_unknown, len(one.xyz))]
-        if len(roofs):
-            near, _ = neighbourhood.nearest(build_index(roofs), points, _REACH_M)
-            is_off &= near < 0
+def _is_off(cloud: Prepared, points: Points) -> Mask:
+    """Return which points (n, 3), in the frame of a cloud, are near none of its roofs in doubt."""
+    roofs = cloud.xyz[cloud.is_unsure_roof]
+    if not len(roofs):
+        return np.ones(len(points), bool)
+    near, _ = neighbourhood.nearest(build_index(roofs), points, _REACH_M)
+    is_off: Mask = near < 0
     return is_off
 
 
@@ -148,7 +153,7 @@ def unheld(left_open_m: float) -> str:
 def _is_unknown(cloud: Prepared, witness: Witness) -> Mask:
     """Say which heard points are of a roof of unknown side."""
     heard = witness.everything.index[witness.everything.asked]
-    is_unknown: Mask = np.broadcast_to(cloud.side_is_unknown, len(cloud.xyz))[heard]
+    is_unknown: Mask = cloud.is_unsure_roof[heard]
     return is_unknown
 
 
@@ -157,7 +162,7 @@ def _silenced(
 ) -> Witness:
     """Return the witness without roofs of unknown side, its own and those it lies next to."""
     index, _ = neighbourhood.nearest(to.everything.neighbours, apply(T, from_.points), _REACH_M)
-    others = np.broadcast_to(other.side_is_unknown, len(other.xyz))[to.everything.index]
+    others = other.is_unsure_roof[to.everything.index]
     meets = (index >= 0) & others[np.maximum(index, 0)]
     return replace(from_, weights=np.where(is_unknown | meets, 0.0, from_.weights))
 

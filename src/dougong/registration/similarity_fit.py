@@ -101,7 +101,7 @@ def fit_similarity(
 
 def _without_unsure_roofs(cloud: Prepared) -> Prepared:
     """Return the cloud without roofs of unknown side; itself where there are none, or all are."""
-    is_sure = ~np.broadcast_to(cloud.side_is_unknown, len(cloud.xyz))
+    is_sure = ~cloud.is_unsure_roof
     if is_sure.all() or int(is_sure.sum()) < MIN_POINTS:
         return cloud
     if cloud not in _sure:

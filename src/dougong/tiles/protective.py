@@ -110,10 +110,7 @@ def judge_spared(job: Job) -> tuple[Arrays, Record]:
     means, cut, *found = job.known
     chosen = select_near(read_arrays(job.folder, job.tile, means, "mean")["mean"], cut)
     _, reason = _verdict(job, *found)
-    spared = spare(chosen, reason == Taken.KEPT)
-    arrays, record = booked(job, spared, Reason.STATISTICAL)
-    count = int((spared.is_kept & ~chosen.is_kept).sum())
-    return arrays, {**record, "spared": count}
+    return booked(job, spare(chosen, reason == Taken.KEPT), Reason.STATISTICAL)
 
 
 def _verdict(

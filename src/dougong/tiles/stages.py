@@ -276,7 +276,8 @@ def _statistical(stage: _Stage) -> Outcome:
     rule = CurvatureWeighted(reach_m=sparing_reach(cut))
     found = _protective_found(replace(stage, params=rule))
     records, key = stage.map("spared", protective.judge_spared, (means, cut, *found))
-    return records, (*notes, *spared_notes(_sum(records, "spared"), beyond)), key
+    spared = beyond - _sum(records, "taken")
+    return records, (*notes, *spared_notes(spared, beyond)), key
 
 
 def _pass_through(stage: _Stage) -> Outcome:
