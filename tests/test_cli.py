@@ -16,6 +16,7 @@ from dougong.cli._common import Common
 from dougong.cli._text import table
 from dougong.cloud import Cloud
 from dougong.errors import InputError
+from dougong.pipeline.provenance import sha256
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = [
@@ -197,6 +198,7 @@ def applied(folder, crs, source, capsys):
     points = np.random.default_rng(0).uniform([116, 39, 0], [116.01, 39.01, 50], (500, 3))
     dougong.write(Cloud.from_points(points, crs=crs), path, overwrite=True)
     moved = folder / "moved.laz"
+    moved.unlink(missing_ok=True)
     tokens = ["transform", path, moved, "--matrix", matrix, "--overwrite"]
     code = call([*map(str, tokens), "--quiet", "--json"])
     answer = json.loads(capsys.readouterr().out)
@@ -204,6 +206,7 @@ def applied(folder, crs, source, capsys):
     return answer["error"]["message"] if code else answer["notes"]
 
 
+FRAMES = ("source_frame", "target_frame")
 FEET = {"crs_wkt": "EPSG:2263", "unit_m": [1200 / 3937] * 3}
 
 
@@ -226,12 +229,76 @@ def test_a_matrix_is_applied_to_the_units_it_is_for(tmp_path, capsys):
     assert "names no coordinate system: its numbers are taken for those of scan, in units" in str(
         applied(tmp_path, None, {"source_frame": FEET}, capsys)
     )
+    without_unit = {"source_frame": {"crs_wkt": "EPSG:2263"}}
+    assert "source_frame" not in str(applied(tmp_path, "EPSG:2263", without_unit, capsys))
     worded = {"source_frame": FEET | {"unit_m": [0.3048006096] * 3}}
     applied(tmp_path, "EPSG:2263", worded, capsys)
     searched = {"source_frame": FEET, "scale_search": {"side": "source"}}
     applied(tmp_path, "EPSG:32650", searched, capsys)
     elsewhere = {"source_frame": {"crs_wkt": "EPSG:32649", "unit_m": [1, 1, 1]}}
     assert "mean the same places" in str(applied(tmp_path, "EPSG:32650", elsewhere, capsys))
+
+
+def test_a_frame_that_a_registration_does_not_name_is_metres_and_that_is_said(tmp_path, capsys):
+    scan = {"source_frame": {"crs_wkt": None, "unit_m": [1, 1, 1]}}
+    drone = {"target_frame": {"crs_wkt": None, "unit_m": [1, 1, 1]}}
+    assert applied(tmp_path, None, scan | drone, capsys) == []
+    (note,) = applied(tmp_path, None, drone, capsys)
+    assert note == (
+        "m.json names no source_frame: the coordinates that its matrix takes are taken for metres. "
+        "Right only if scan was in metres"
+    )
+    (note,) = applied(tmp_path, None, scan, capsys)
+    assert "no target_frame: the coordinates that its matrix gives are taken for metres" in note
+    (note,) = applied(tmp_path, None, scan | {"target_frame": {"crs_wkt": None}}, capsys)
+    assert "no unit_m in its target_frame" in note
+    searched = drone | {"scale_search": {"side": "source"}}
+    assert applied(tmp_path, None, searched, capsys) == []
+    said = applied(tmp_path, "EPSG:2263", {}, capsys)
+    assert "register it itself. m.json names no source_frame: metres are expected." in said
+
+
+def test_a_matrix_that_was_changed_alone_is_said(tmp_path, capsys):
+    frames = {name: {"crs_wkt": None, "unit_m": [1, 1, 1]} for name in FRAMES}
+    inverse = np.eye(4)
+    assert applied(tmp_path, None, frames | {"matrix_inverse": inverse.tolist()}, capsys) == []
+    inverse[0, 3] = -10
+    (note,) = applied(tmp_path, None, frames | {"matrix_inverse": inverse.tolist()}, capsys)
+    assert "matrix and matrix_inverse of m.json are not of one pose (10 m apart" in note
+    (note,) = applied(tmp_path, None, frames | {"matrix_inverse": [[1]]}, capsys)
+    assert "matrix_inverse of m.json is no transform" in note
+
+
+def test_a_registration_that_failed_is_never_applied(room, capsys):
+    path = room.with_name("m.json")
+    path.write_text(json.dumps({"status": "failed", "matrix": np.eye(4).tolist(), "reason": "No."}))
+    tokens = ["transform", str(room), str(room.with_name("t.laz")), "--matrix", str(path)]
+    assert call([*tokens, "--accept-best", "--quiet"]) == 1
+    assert "the registration failed, there is no pose to apply. No." in capsys.readouterr().err
+    assert not room.with_name("t.laz").exists()
+
+
+def test_a_registration_that_an_editor_saved_with_its_mark_is_read(room):
+    path = room.with_name("m.json")
+    path.write_text(framed(), encoding="utf-8-sig")
+    tokens = ["transform", str(room), str(room.with_name("t.laz")), "--matrix", str(path)]
+    assert call([*tokens, "--quiet"]) == 0
+
+
+def test_a_file_that_is_not_the_registered_one_is_said(room, capsys):
+    path, moved = room.with_name("m.json"), room.with_name("t.laz")
+    tokens = ["transform", str(room), str(moved), "--matrix", str(path), "--overwrite", "--json"]
+    document = json.loads(framed())
+    for digest, is_said in (("0" * 64, True), (sha256(room), False)):
+        inputs = [{"path": f"scans/{room.name}", "sha256": digest, "points": 12_000}]
+        path.write_text(json.dumps(document | {"inputs": inputs}))
+        assert call([*tokens, "--quiet"]) == 0
+        notes = str(json.loads(capsys.readouterr().out)["notes"])
+        assert ("room.laz is not the file that was registered" in notes) == is_said
+    inputs = [{"path": "scans/other.laz", "sha256": "0" * 64, "points": 12_000}, "junk"]
+    path.write_text(json.dumps(document | {"inputs": inputs}))
+    assert call([*tokens, "--quiet"]) == 0
+    assert "not the file" not in capsys.readouterr().out
 
 
 def test_check_of_a_broken_file_exits_1(tmp_path, capsys):
@@ -330,13 +397,32 @@ def test_outputs_that_cannot_be_meant_are_usage_errors(room, capsys):
         assert said in capsys.readouterr().err
 
 
+def framed(source=None, target=None):
+    """Return a registration of no move, in words, with frames as given."""
+    document = {"status": "ok", "source": "scan", "matrix": np.eye(4).tolist()}
+    return json.dumps(document | {"source_frame": source, "target_frame": target})
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ('{"status": "ok", "matrix": [["x"]]}', "four rows of four numbers"),
         ('{"status": "ok", "matrix": [[1, 2], [3, 4]]}', "finite 4x4 matrix"),
         ("[1]", "holds a list"),
-        ("\xff", "is no JSON file"),
+        ("\xff", "is no JSON file: it is no UTF-8 text"),
+        ('{"status": "ok",\n "matrix": 1,}', "is no JSON file: line 2, column 14: "),
+        ('{"status": "OK", "matrix": 1}', "has status 'OK'; expected ok, ambiguous or failed"),
+        ('{"status": "ok"}', "has no matrix"),
+        (framed(source="metres"), "source_frame of m.json must be an object, got 'metres'"),
+        (framed(target=[1, 1, 1]), "target_frame of m.json must be an object, got [1, 1, 1]"),
+        (framed(source={"unit_m": 1.0}), "source_frame.unit_m of m.json must be three positive"),
+        (framed(source={"unit_m": [1, 1]}), "must be three positive numbers, metres per unit of"),
+        (framed(target={"unit_m": [1, -1, 1]}), "target_frame.unit_m of m.json must be three"),
+        (framed(target={"unit_m": ["m", "m", "m"]}), "must be three positive numbers"),
+        (framed(target={"unit_m": [True, 1, 1]}), "must be three positive numbers"),
+        (framed(target={"crs_wkt": 32650}), "target_frame.crs_wkt of m.json is no coordinate"),
+        (framed(source={"crs_wkt": "UTM"}), "crs_wkt of m.json is no coordinate system: 'UTM'"),
+        ('{"status": "ok", "matrix": 1, "scale_search": "none"}', "scale_search of m.json must"),
         (None, "cannot be read: Is a directory"),
     ],
 )

@@ -24,9 +24,8 @@ from dougong.pipeline.memory import refuse_too_large
 from dougong.pipeline.outputs import refuse_output, watched
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import stem
-from dougong.pipeline.registrations import Known, finite, read_registration
-
-Unit = tuple[float, float, float]
+from dougong.pipeline.provenance import sha256
+from dougong.pipeline.registrations import Known, Unit, finite, read_registration
 
 
 def transform_file(
@@ -54,7 +53,7 @@ def transform_file(
     refuse_output(input, output, [output], overwrite)
     crs, unit_m = system_in(input)
     _require_unit(input, crs, unit_m, known)
-    notes = _system_notes(input, crs, unit_m, known)
+    notes = [*known.notes, *_file_notes(input, known), *_system_notes(input, crs, unit_m, known)]
     if known.target_crs is not None and is_same_crs(crs, known.target_crs):
         notes.append(
             f"{input.name} is in {known.target}'s coordinate system already; check that it is "
@@ -118,9 +117,11 @@ def _require_unit(input: Path, crs: str | None, unit_m: Unit | None, known: Know
         return
     own = _unit_name(unit_m) + (f" ({units.name})" if units.name else "")
     source = known.source or "its source"
+    told = f" {known.without_source}: metres are expected." if known.without_source else ""
     msg = (
         f"{input.name} is in {own}, and the matrix takes the coordinates of {source}, in "
-        f"{_unit_name(known.source_unit_m)}. Convert {input.name} to those, or register it itself."
+        f"{_unit_name(known.source_unit_m)}. Convert {input.name} to those, or register it "
+        f"itself.{told}"
     )
     raise FrameError(msg)
 
@@ -131,6 +132,20 @@ def _unit_name(unit_m: Unit) -> str:
         "metres" if value == 1.0 else f"units of {value:.9g} m" for value in (unit_m[0], unit_m[2])
     )
     return plan if plan == height else f"{plan} with heights in {height}"
+
+
+def _file_notes(input: Path, known: Known) -> list[str]:
+    """Return what is to be said of a file that is called as a registered one, and is another."""
+    # By the name alone: the path is as it was given then, and may be of another machine.
+    digests = [
+        one.get("sha256") for one in known.inputs if Path(str(one.get("path"))).name == input.name
+    ]
+    if not digests or sha256(input) in digests:
+        return []
+    return [
+        f"{input.name} is not the file that was registered under this name (its SHA-256 is "
+        "another): the matrix is right only if its coordinates are those of that one"
+    ]
 
 
 def _system_notes(input: Path, crs: str | None, unit_m: Unit | None, known: Known) -> list[str]:
