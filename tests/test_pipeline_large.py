@@ -1,5 +1,6 @@
 """A run whose clouds do not fit in memory: the same files as one whose clouds do."""
 
+import importlib
 import json
 import os
 import subprocess
@@ -266,3 +267,42 @@ def test_books_of_any_size_hold_a_page_at_a_time(tmp_path):
     tracemalloc.stop()
     assert sum(tally.reasons.values()) == n
     assert peak < 60_000_000
+
+
+def replaced_at(monkeypatch, place, path):
+    """Have `path` written again, with other points, as soon as the function at `place` returns."""
+    module, name = place.rsplit(".", 1)
+    function = getattr(importlib.import_module(module), name)
+
+    def replacing(*args, **more):
+        found = function(*args, **more)
+        dougong.write(Cloud.from_points(site(7, 0.0, 0.002)[1:]), path, overwrite=True)
+        return found
+
+    monkeypatch.setattr(place, replacing)
+
+
+@pytest.mark.parametrize(
+    ("room", "place"),
+    [
+        ("whole", "dougong.pipeline.filtering.read"),
+        ("many", "dougong.pipeline.filtering.identified"),
+    ],
+)
+def test_a_file_replaced_while_it_is_filtered_ends_the_filter(
+    room, place, folder, monkeypatch, capsys
+):
+    scan, out = folder / "scan.laz", folder / "out.laz"
+    replaced_at(monkeypatch, place, scan)
+    tokens = ["filter", str(scan), str(out), "--kind", "lidar", "--memory", ROOMS[room], "--quiet"]
+    assert call(tokens) == 1
+    assert "scan.laz was changed or replaced while it was worked on" in capsys.readouterr().err
+    assert {path.name for path in folder.iterdir()} == {"scan.laz", "map.laz"}
+
+
+def test_a_file_replaced_while_it_is_registered_ends_the_registration(folder, monkeypatch, capsys):
+    replaced_at(monkeypatch, "dougong.pipeline.registering_files.read", folder / "scan.laz")
+    tokens = ["register", str(folder / "scan.laz"), str(folder / "map.laz")]
+    assert call([*tokens, "--out", str(folder / "out"), "--quiet"]) == 1
+    assert "scan.laz was changed or replaced while it was worked on" in capsys.readouterr().err
+    assert {path.name for path in folder.iterdir()} == {"scan.laz", "map.laz"}

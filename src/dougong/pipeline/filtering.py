@@ -27,7 +27,14 @@ from dougong.pipeline.marking import GROUND_CLASS, marked, marks_clutter, with_c
 from dougong.pipeline.memory import Room
 from dougong.pipeline.outputs import refuse_output, watched, write_json
 from dougong.pipeline.progress import Progress
-from dougong.pipeline.provenance import Clock, peak_memory_bytes, sha256, software
+from dougong.pipeline.provenance import (
+    Clock,
+    Stamp,
+    identified,
+    peak_memory_bytes,
+    require_unchanged,
+    software,
+)
 from dougong.pipeline.recipes import (
     LidarRecipe,
     PhotogrammetryRecipe,
@@ -137,14 +144,14 @@ def filter_file(
     InputError
         An output exists, or the job needs more memory than it may use.
     FormatError, OutputError
-        The input cannot be read, the output not written (a full disk).
+        The input cannot be read or is replaced meanwhile, the output not written (a full disk).
     """
     beside = output.with_name(output.name + ".json")
     refuse_output(input, output, [output, beside], overwrite)
     clock = Clock()
     progress.stage(f"reading {input.name}")
     with clock.measure("read"):
-        digest = sha256(input)
+        digest, stamp = identified(input)
     room = Room.of(memory_bytes)
     with _places(output, work, f"{digest} {job.tiled().grid!r} in {room.bytes:.0f}") as places:
         result: Cloud | Pieces
@@ -153,12 +160,13 @@ def filter_file(
         if is_too_large(input, room, 0):
             progress.note(f"{input.name} is larger than memory: it is filtered on tiles")
             with clock.measure("filter"):
-                books, again = _filtered_on_tiles(input, job, room, places, progress)
+                books, again = _filtered_on_tiles(input, stamp, job, room, places, progress)
             hold = Hold(room.held_points(), output.parent)
             result = _pieces(again, job, books, mark)
         else:
             with clock.measure("read"):
                 cloud = read(input)
+                require_unchanged(input, stamp)
                 noticed = (*cloud.notes, *faults_of(cloud))
             with clock.measure("filter"):
                 filtered = job.run(cloud, progress)
@@ -216,10 +224,11 @@ def _pieces(cloud: Pieces, job: FilterJob, books: Books, mark: bool) -> Pieces:
     return pieces
 
 
-def _decoded(input: Path) -> Iterator[Cloud]:
-    """Return the chunks of a file, all its scans as one cloud."""
+def _decoded(input: Path, stamp: Stamp) -> Iterator[Cloud]:
+    """Yield the chunks of a file, all its scans as one cloud, if it stays as it is meanwhile."""
     (chunks,) = stations_of(input, split=False)
-    return chunks
+    yield from chunks
+    require_unchanged(input, stamp)
 
 
 def _filter_document(job: FilterJob, books: Books, written: int, mark: bool) -> Document:
@@ -251,11 +260,16 @@ def _filter_document(job: FilterJob, books: Books, written: int, mark: bool) -> 
 
 
 def _filtered_on_tiles(
-    input: Path, job: FilterJob, room: Room, places: tuple[Folder, Path], progress: Progress
+    input: Path,
+    stamp: Stamp,
+    job: FilterJob,
+    room: Room,
+    places: tuple[Folder, Path],
+    progress: Progress,
 ) -> tuple[Books, Pieces]:
     """Return what was decided about every point of the file, and its points once more."""
     books, spool = filter_chunks(
-        _decoded(input),
+        _decoded(input, stamp),
         job.tiled(),
         points=describe(input).points,
         room=room,
@@ -264,7 +278,7 @@ def _filtered_on_tiles(
         scratch=places[1],
         progress=progress,
     )
-    return books, partial(_decoded, input) if spool is None else spool.pieces
+    return books, partial(_decoded, input, stamp) if spool is None else spool.pieces
 
 
 def reason_table(tally: Tally) -> dict[str, dict[str, Any]]:

@@ -19,7 +19,7 @@ from dougong.pipeline.memory import Room
 from dougong.pipeline.movers import Mover, Source
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Entry, files_of
-from dougong.pipeline.provenance import Clock, Stamp, require_unchanged, sha256, stamp_of
+from dougong.pipeline.provenance import Clock, Stamp, identified, require_unchanged
 from dougong.pipeline.recipes import Recipe, filter_cloud, steps_of
 from dougong.pipeline.removed import removed_sample
 from dougong.pipeline.spooling import spooled
@@ -87,9 +87,8 @@ class Loader:
 
     def _sources(self, entry: Entry, file: Path) -> Iterator[Source]:
         self.progress.stage(f"reading {file.name}")
-        self.stamps[file] = stamp_of(file)
         with self.clock.measure("read"):
-            digest = sha256(file)
+            digest, self.stamps[file] = identified(file)
         if entry.name in self.units and self.units[entry.name] is None:
             found = self._unfiltered(entry, file)
         elif is_too_large(file, self.room, self.waiting):

@@ -19,8 +19,17 @@ from dougong.kernels import _jit
 _LIBRARIES = ("numpy", "scipy", "numba", "lazrs", "pye57", "opencv-python-headless")
 
 
+Stamp = tuple[int, int]
+"""Bytes of a file, and when it was last written, nanoseconds."""
+
+
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a cloud's file, read in blocks of 4 MiB.
+    """Return the SHA-256 of a cloud's file; see `identified`."""
+    return identified(path)[0]
+
+
+def identified(path: Path) -> tuple[str, Stamp]:
+    """Return the SHA-256 of a cloud's file, read in blocks of 4 MiB, and its stamp before that.
 
     Raises
     ------
@@ -29,13 +38,10 @@ def sha256(path: Path) -> str:
     """
     digest = hashlib.sha256()
     with opened(path) as file:
+        stamp = stamp_of(path)
         while block := file.read(1 << 22):
             digest.update(block)
-    return digest.hexdigest()
-
-
-Stamp = tuple[int, int]
-"""Bytes of a file, and when it was last written, nanoseconds."""
+    return digest.hexdigest(), stamp
 
 
 def stamp_of(path: Path) -> Stamp:

@@ -22,7 +22,12 @@ from dougong.pipeline.memory import refuse_too_large
 from dougong.pipeline.pairs import read_pairs
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import stem
-from dougong.pipeline.provenance import peak_memory_bytes, sha256, software
+from dougong.pipeline.provenance import (
+    identified,
+    peak_memory_bytes,
+    require_unchanged,
+    software,
+)
 from dougong.pipeline.registering import register
 from dougong.pipeline.registrations import to_document
 from dougong.pipeline.settings import validated
@@ -112,16 +117,18 @@ class _Input:
 def _read(path: Path, kind: Kind | None, system: str | None, progress: Progress) -> _Input:
     """Read a cloud; its kind is guessed where it is not given, and that is said."""
     progress.stage(f"reading {path.name}")
+    digest, stamp = identified(path)
     cloud = in_system(read(path), system)
     guessed = []
     if kind is None:
         kind, why = guess_kind_of(path, describe(path))
         guessed = [f"{path.name} is taken for {kind} ({why})"]
+    require_unchanged(path, stamp)
     noticed = [f"{path.name}: {note}" for note in (*cloud.notes, *faults_of(cloud))]
     return _Input(
         cloud=replace(cloud, name=stem(path)),
         kind=kind,
-        record={"path": str(path), "sha256": sha256(path), "points": len(cloud)},
+        record={"path": str(path), "sha256": digest, "points": len(cloud)},
         notes=(*guessed, *noticed),
     )
 
