@@ -153,6 +153,81 @@ def test_more_than_a_ply_header_declares_is_said(tmp_path, text, faces):
     assert note in describe(path).notes
 
 
+def mesh(path, order="<", extra=b"", head="", lengths=(3,), rows=400):
+    """Write three vertices, then faces of such lengths in turn; lists may stand in `head` too."""
+    rng = np.random.default_rng(0)
+    name = "little" if order == "<" else "big"
+    text = f"ply\nformat binary_{name}_endian 1.0\n{head}element vertex 3\n"
+    text += "property float x\nproperty float y\nproperty float z\n"
+    text += f"element face {rows}\nproperty uchar flags\nproperty list uchar int vertex_indices\n"
+    text += "property list ushort float texcoord\nend_header\n"
+    body = np.arange(9, dtype=f"{order}f4").tobytes()
+    for row in range(rows):
+        count = lengths[row % len(lengths)]
+        body += struct.pack(f"{order}BB{count}i", rng.integers(256), count, *range(count))
+        body += struct.pack(f"{order}H{2 * count}f", 2 * count, *rng.random(2 * count))
+    path.write_bytes(text.encode() + body + extra)
+    return path
+
+
+def about_the_end(path):
+    return [note for note in read(path).notes if "wrongly" in note]
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("lengths", [(3,), (3, 4), (3,) * 100 + (5, 0, 4)])
+def test_what_follows_behind_lists_of_a_binary_ply_is_said(tmp_path, order, lengths, monkeypatch):
+    monkeypatch.setattr("dougong.formats.ply_lists._RUN_ROWS", 70)
+    path = tmp_path / "a.ply"
+    assert not about_the_end(mesh(path, order, lengths=lengths))
+    assert not about_the_end(mesh(path, order, b"\r\n", lengths=lengths))
+    (note,) = about_the_end(mesh(path, order, b"junk" * 9, lengths=lengths))
+    assert note.startswith("its header declares 3 points, wrongly: 36 bytes (of 12 a point) follow")
+    assert note in describe(path).notes
+    mesh(path, order, lengths=lengths)
+    path.write_bytes(path.read_bytes()[:-3])
+    (note,) = about_the_end(path)
+    assert note.startswith("it ends inside its face elements, or its header declares 3 points")
+
+
+def test_lists_of_the_vertices_or_before_them_hide_nothing_behind(tmp_path):
+    head = (
+        "ply\nformat binary_little_endian 1.0\nelement patch 2\nproperty list uchar uchar part\n"
+        "element vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+        "property list uchar int views\nend_header\n"
+    )
+    body = bytes([1, 7, 2, 8, 9])
+    body += struct.pack("<3fB2i", 1, 2, 3, 2, 0, 1) + struct.pack("<3fB", 4, 5, 6, 0)
+    path = tmp_path / "a.ply"
+    path.write_bytes(head.encode() + body)
+    assert read(path).frame.to_file(read(path).xyz).tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert not about_the_end(path)
+    path.write_bytes(head.encode() + body + body)
+    assert len(about_the_end(path)) == 1
+
+
+@pytest.mark.parametrize("kind", ["float int", "octet int", "uchar octet"])
+def test_lists_of_types_that_cannot_be_followed_say_nothing(tmp_path, kind):
+    path = mesh(tmp_path / "a.ply")
+    path.write_bytes(path.read_bytes().replace(b"uchar int vertex", f"{kind} vertex".encode()))
+    assert len(read(path)) == 3
+    assert not about_the_end(path)
+
+
+def test_a_list_of_negative_length_is_where_a_ply_ends(tmp_path):
+    path = mesh(tmp_path / "a.ply", lengths=(200,), rows=2)
+    path.write_bytes(path.read_bytes().replace(b"uchar int vertex", b"char int vertex"))
+    (note,) = about_the_end(path)
+    assert "ends inside its face elements" in note
+
+
+def test_lines_that_a_text_ply_lacks_are_said(tmp_path):
+    path = save(tmp_path / "a.ply", vertices(), text=True, faces=20)
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:-5]))
+    (note,) = about_the_end(path)
+    assert note.startswith("it ends inside its other elements")
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

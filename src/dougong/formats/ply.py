@@ -16,19 +16,13 @@ import numpy as np
 
 from dougong.cloud import BitField, Cloud, Records
 from dougong.errors import FormatError
+from dougong.formats.ply_lists import TYPES, Element, end_of
 from dougong.formats.stream import Block, opened, refuse_empty, stem_of
 from dougong.formats.text_rows import RowFormat, parse_rows
 from dougong.formats.units import as_wkt, is_same_crs
 
-_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
-    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
-    "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
-}  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 _AXES = (("x", "y", "z"), ("X", "Y", "Z"))
-Element = tuple[str, int, list[list[str]]]
-"""Name, count, the words of each property line."""
 CRS_COMMENT = "crs "
 _LINE_END = 2
 """Bytes that a text tool may leave behind the points."""
@@ -60,8 +54,12 @@ class PlyScan:
     notes: tuple[str, ...] = ()
     bits: dict[str, BitField] = field(default_factory=dict)
     loaded: Records | None = None
-    behind: int | None = None
-    """Bytes (of ASCII: lines) of the elements behind the vertices; None: not known."""
+    elements: tuple[Element, ...] = ()
+    """All of the file, as its header declares them."""
+    first: int = 0
+    """Where the first of them begins."""
+    is_asked: bool = False
+    """Whether it is known by now what follows behind them."""
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -73,31 +71,45 @@ class PlyScan:
         for records in self._records(rows):
             coordinates = np.stack([records[a].astype(np.float64) for a in self.axes], axis=1)
             yield Block(records, coordinates)
-        note = self._surplus()
-        if note is not None and note not in self.notes:
-            self.notes = (*self.notes, note)
+        if not self.is_asked:
+            self.is_asked = True
+            note = self._ending()
+            self.notes = self.notes if note is None else (*self.notes, note)
 
-    def _surplus(self) -> str | None:
-        """Return in words what follows all that the header declares; None: nothing, not known."""
-        if self.behind is None:
-            return None
-        with opened(self.path) as file:
-            file.seek(self.start)
-            if self.header.encoding == "ascii":
-                extra = sum(bool(line.strip()) for line in file) - self.count - self.behind
-                said = f"{extra:,} lines"
-            else:
-                end = file.seek(self.count * self.dtype.itemsize + self.behind, 1)
-                extra = self.path.stat().st_size - end
-                if extra <= _LINE_END and not file.read().strip():
-                    return None
-                said = f"{extra:,} bytes (of {self.dtype.itemsize} a point)"
+    def _ending(self) -> str | None:
+        """Return in words that more or less is there than the header declares; None: neither."""
+        if self.header.encoding == "ascii":
+            with opened(self.path) as file:
+                file.seek(self.first)
+                extra = sum(bool(line.strip()) for line in file)
+            extra -= sum(count for _, count, _ in self.elements)
+            said = f"{extra:,} lines"
+            end: int | str | None = "other" if extra < 0 else 0
+        else:
+            end = end_of(self.path, self.first, self.elements, _ORDERS[self.header.encoding])
+            extra = self.path.stat().st_size - end if isinstance(end, int) else 0
+            # What `loaded` holds has no lists: it does not tell the bytes of a point.
+            each = "" if self.loaded is not None else f" (of {self.dtype.itemsize} a point)"
+            said = f"{extra:,} bytes{each}"
+            if isinstance(end, int) and extra <= _LINE_END and not self._tail(end):
+                return None
+        if isinstance(end, str):
+            return (
+                f"it ends inside its {end} elements, or its header declares {self.count:,} points "
+                "wrongly. Copy it again."
+            )
         if extra <= 0:
             return None
         return (
             f"its header declares {self.count:,} points, wrongly: {said} follow after all that it "
             "declares, and are not read. Export it again."
         )
+
+    def _tail(self, start: int) -> bytes:
+        """Return the few bytes from `start` on, but for line ends."""
+        with opened(self.path) as file:
+            file.seek(start)
+            return file.read().strip()
 
     def _records(self, rows: int) -> Iterator[Records]:
         if self.loaded is not None:
@@ -193,7 +205,7 @@ def _placed(
     at: int,
     start: int,
 ) -> PlyScan:
-    _, count, properties = elements[at]
+    first, (_, count, properties) = start, elements[at]
     refuse_empty(count, path)
     order = _ORDERS[header.encoding]
     notes = tuple(
@@ -212,8 +224,8 @@ def _placed(
     else:
         dtype = _layout(path, properties, order)
         start += sum(n * _layout(path, words, order).itemsize for _, n, words in elements[:at])
-        behind = _behind(path, header.encoding, elements[at + 1 :])
-        scan = PlyScan(path, name, header, dtype, count, start, crs, notes, behind=behind)
+        scan = PlyScan(path, name, header, dtype, count, start, crs, notes)
+    scan.elements, scan.first = tuple(elements), first
     if not any(set(axes) <= set(scan.dtype.names or ()) for axes in _AXES):
         msg = (
             f"{path.name} has vertices without x, y and z; its properties are "
@@ -226,22 +238,13 @@ def _placed(
 def _layout(path: Path, properties: list[list[str]], order: str) -> np.dtype[np.void]:
     fields = []
     for words in properties:
-        if words[0] not in _TYPES:
+        if words[0] not in TYPES:
             raise FormatError(f"{path.name} has a PLY property of unknown type {words[0]!r}.")
-        fields.append((words[1], order + _TYPES[words[0]]))
+        fields.append((words[1], order + TYPES[words[0]]))
     try:
         return np.dtype(fields)
     except ValueError as error:
         raise FormatError(f"{path.name} names a PLY property twice: {error}.") from error
-
-
-def _behind(path: Path, encoding: str, elements: list[Element]) -> int | None:
-    """Return the bytes, of ASCII the lines, of some elements; None: their lists vary in length."""
-    if encoding == "ascii":
-        return sum(count for _, count, _ in elements)
-    if any(words[0] == "list" for _, _, properties in elements for words in properties):
-        return None
-    return sum(count * _layout(path, words, "<").itemsize for _, count, words in elements)
 
 
 def _by_plyfile(path: Path) -> tuple[Records, list[str]]:
