@@ -376,6 +376,30 @@ def test_empty_file_with_a_header(tmp_path):
     assert describe(tmp_path / "a.las").points == 0
 
 
+@pytest.mark.parametrize(("point_format", "version"), [(3, "1.2"), (1, "1.3"), (6, "1.4")])
+def test_points_that_a_las_header_does_not_count_are_said(tmp_path, point_format, version):
+    path = tmp_path / "a.las"
+    random_las(path, point_format, version, count=100)
+    for suffix in (".las", ".laz"):
+        write(read(path), tmp_path / f"b{suffix}", overwrite=True)
+        assert not [n for n in read(tmp_path / f"b{suffix}").notes if "wrongly" in n]
+    raw = bytearray(path.read_bytes())
+    size = struct.unpack_from("<H", raw, 105)[0]
+    layout, place = ("<Q", 247) if version == "1.4" else ("<I", 107)
+    struct.pack_into(layout, raw, place, 60)
+    path.write_bytes(raw)
+    (note,) = [note for note in read(path).notes if "wrongly" in note]
+    said = f"its header declares 60 points, wrongly: {40 * size:,} bytes (of {size} a point) follow"
+    assert note.startswith(said)
+    assert note in describe(path).notes
+    assert [f.severity for f in check(path) if "wrongly" in f.text] == ["warning"]
+    struct.pack_into(layout, raw, place, 0)
+    path.write_bytes(raw)
+    with pytest.raises(FormatError, match=rf"no points by its header, but {100 * size:,} bytes"):
+        read(path)
+    assert "its writer may have been stopped" in check(path)[0].text
+
+
 @pytest.mark.parametrize(
     ("offset", "value", "words"),
     [

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import laspy
 import numpy as np
 import pytest
 
@@ -124,3 +125,13 @@ def test_people_read_a_table(site, capsys):
 def test_no_cloud_is_one_sentence(capsys):
     assert call(["plan"]) == 2
     assert capsys.readouterr().err.startswith("error: ")
+
+
+def test_a_cloud_without_points_is_refused_before_the_run(site, capsys):
+    laspy.LasData(laspy.LasHeader(point_format=6, version="1.4")).write(site / "void.las")
+    files = [*("--lidar", str(site / "scan.laz")), *("--lidar", str(site / "void.las"))]
+    for command in (["plan"], ["run", "--out", str(site / "result")]):
+        assert call([*command, *files, "--memory", "4GB"]) == 1
+        shown = capsys.readouterr()
+        assert "void.las holds no points" in shown.err
+        assert "reading scan" not in shown.err

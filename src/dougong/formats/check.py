@@ -84,9 +84,9 @@ def check(path: Path | str) -> list[Finding]:
     path = Path(path)
     try:
         info = describe(path)
-        if info.points == 0:
-            return [Finding("error", f"{path.name} holds no points. Export it again.")]
         tally = _pass(path, info)
+        if tally.rows == 0:
+            return [Finding("error", f"{path.name} holds no points. Export it again.")]
     except FormatError as error:
         return [Finding("error", str(error))]
     findings = [
@@ -102,7 +102,8 @@ def check(path: Path | str) -> list[Finding]:
 def _pass(path: Path, info: FileInfo) -> _Tally:
     tally = _Tally()
     for chunk in iterate(path, _CHUNK):
-        tally.add(chunk, max(1, info.points // SAMPLE))
+        if len(chunk):
+            tally.add(chunk, max(1, info.points // SAMPLE))
     return tally
 
 

@@ -159,6 +159,28 @@ def _cloud(records: Records, header: LasHeader, frame: Frame, path: Path) -> Clo
     )
 
 
+def _uncounted(header: LasHeader, path: Path) -> int:
+    """Return the bytes behind the points that the header counts, where others would lie."""
+    ends = [path.stat().st_size]
+    if header.evlr_place[1]:
+        ends.append(header.evlr_place[0])
+    if header.waveforms_start:
+        ends.append(header.waveforms_start)
+    return min(ends) - header.points_start - header.count * header.point_bytes
+
+
+def _refuse_empty(header: LasHeader, path: Path) -> None:
+    """Raise FormatError where the header counts no points, and say what is there all the same."""
+    left = _uncounted(header, path)
+    if header.count == 0 and left >= header.point_bytes and not header.is_compressed:
+        msg = (
+            f"{path.name} holds no points by its header, but {left:,} bytes where they would be "
+            f"({header.point_bytes} a point): its writer may have been stopped. Export it again."
+        )
+        raise FormatError(msg)
+    refuse_empty(header.count, path)
+
+
 def _notes(header: LasHeader, frame: Frame, path: Path) -> tuple[str, ...]:
     found = list(unit_notes(frame))
     if header.is_compressed != path.suffix.lower().endswith("laz"):
@@ -173,20 +195,26 @@ def _notes(header: LasHeader, frame: Frame, path: Path) -> tuple[str, ...]:
             f"its header states no usable box (x {x:g} to {x_high:g}, y {y:g} to {y_high:g}, z "
             f"{z:g} to {z_high:g}), wrongly; the points themselves count."
         )
+    left = 0 if header.is_compressed else _uncounted(header, path)
+    if header.count and left >= header.point_bytes:
+        found.append(
+            f"its header declares {header.count:,} points, wrongly: {left:,} bytes (of "
+            f"{header.point_bytes} a point) follow behind them, and are not read. Export it again."
+        )
     return tuple(found)
 
 
 def read(path: Path) -> Cloud:
     """Return the whole file. Memory: the records and 24 bytes per point."""
     with _points(path) as (header, take):
-        refuse_empty(header.count, path)
+        _refuse_empty(header, path)
         return _cloud(take(header.count), header, frame_of(header), path)
 
 
 def iterate(path: Path, chunk_points: int) -> Iterator[Cloud]:
     """Yield the file in clouds of `chunk_points` that share one frame."""
     with _points(path) as (header, take):
-        refuse_empty(header.count, path)
+        _refuse_empty(header, path)
         frame = frame_of(header)
         for start in range(0, header.count, chunk_points):
             yield _cloud(take(min(chunk_points, header.count - start)), header, frame, path)

@@ -197,6 +197,11 @@ class LasHeader:
         return int(self._get("Q", 235)[0]), int(self._get("I", 243)[0])
 
     @cached_property
+    def waveforms_start(self) -> int:
+        """File position of the waveforms behind the points; 0 where the file has none."""
+        return int(self._get("Q", 227)[0]) if self.minor >= 3 else 0
+
+    @cached_property
     def dtype(self) -> np.dtype[np.void]:
         """Layout of one point: the standard fields, then the extra dimensions."""
         fields: list[tuple[str, str]] = list(POINT_FORMATS[self.point_format])

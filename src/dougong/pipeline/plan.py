@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dougong.formats import FileInfo, describe
+from dougong.formats.stream import refuse_empty
 from dougong.pipeline.memory import Room, estimated_bytes
 from dougong.pipeline.plan_stages import (
     PlannedFile,
@@ -83,7 +84,7 @@ def plan_run(
     Raises
     ------
     InputError, FormatError
-        A pattern finds no file, or a file cannot be read.
+        A pattern finds no file, or a file cannot be read or holds no points.
     """
     files: list[PlannedFile] = []
     row_bytes: dict[str, int] = {}
@@ -91,6 +92,7 @@ def plan_run(
     for entry in project.cloud:
         for path in files_of(entry, folder):
             told = describe(path)
+            refuse_empty(told.points, path)
             planned, refusal = _planned(entry, told, room, _held(files), shown(path))
             files.append(planned)
             row_bytes[planned.path] = _row_bytes(told)
