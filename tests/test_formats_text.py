@@ -96,6 +96,24 @@ def test_meaning_of_columns_without_a_header_is_guessed_and_said(tmp_path, rows,
         assert cloud.attribute(name).tolist() == expected[:, index].tolist()
 
 
+@pytest.mark.parametrize(
+    ("rows", "is_said"),
+    [
+        ([f"{k} {k % 7}.5 {k % 5} 1.25" for k in range(1, 40)], True),
+        ([f"{k} {k % 7}.5 {k % 5}" for k in range(1, 40)], False),  # a z is needed
+        ([f"{k} 12.5 {k % 5} 1.25" for k in range(1, 40)], False),  # a line of a grid
+        ([f"{k % 30} {k % 7}.5 {k % 5} 1.25" for k in range(1, 40)], False),
+        ([f"{k} {k % 7}.5 {k % 5} 1.25" for k in range(1, 4)], False),
+    ],
+)
+def test_a_first_column_that_numbers_the_points_is_said(tmp_path, rows, is_said):
+    path = save(tmp_path, "\n".join(rows))
+    notes = [note for note in read(path).notes if "wrongly read as x" in note]
+    assert bool(notes) == is_said
+    found = [f for f in check(path) if "goes up by one from row to row (1, 2, ...)" in f.text]
+    assert [f.severity for f in found] == ["warning"] * is_said
+
+
 @pytest.mark.parametrize("first", ["", "2\n"])
 def test_the_fourth_of_seven_pts_columns_is_the_intensity(tmp_path, first):
     """Even where its values could be a colour's."""

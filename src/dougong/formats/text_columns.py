@@ -24,6 +24,7 @@ _SYNONYMS = {
     "classification": {"classification", "class", "label"},
 }  # fmt: skip
 _UNIT = re.compile(r"\s*[\[(](m|metres?|meters?)[\])]$")
+_FEW_ROWS = 20
 _RGB = ("red", "green", "blue")
 _NORMAL = ("nx", "ny", "nz")
 
@@ -94,7 +95,21 @@ def column_names(
             at += 1
     if count == 3:
         return tuple(names), None
-    return tuple(names), f"no header line: columns were taken as {' '.join(names)}."
+    said = f"no header line: columns were taken as {' '.join(names)}."
+    if not is_pts and _counts_rows(sample):
+        said += (
+            f" The first goes up by one from row to row ({sample[0, 0]:.0f}, {sample[1, 0]:.0f}, "
+            "...): if it only numbers the points, it is wrongly read as x. Name the columns in a "
+            "header line."
+        )
+    return tuple(names), said
+
+
+def _counts_rows(sample: NDArray[np.float64]) -> bool:
+    """Say whether the first column numbers the rows; a line of a grid has one y, too."""
+    first, second = sample[:, 0], sample[:, 1]
+    has_many = len(sample) >= _FEW_ROWS
+    return has_many and bool((np.diff(first) == 1.0).all() and (second != second[0]).any())
 
 
 def _is_intensity(sample: NDArray[np.float64], at: int, count: int) -> bool:
