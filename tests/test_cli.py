@@ -91,6 +91,10 @@ def test_every_command_helps_with_an_example(command, capsys):
         (["info", "a.laz", "--memory", "lots"], "--memory needs a size"),
         (["info", "a.laz", "--threads", "0"], "--threads must be 1 or more"),
         (["register", "a", "b", "--out", "c", "--dof", "8"], "--dof"),
+        (
+            ["--quiet", "transform", "a", "b", "c", "d", "--matrix", "m"],
+            "'c' and 1 more: more than",
+        ),
         (["register", "a", "b", "--out", "c", "--least-overlap", "15"], "--least-overlap"),
     ],
 )

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dougong.cli import call
 from dougong.cloud import Cloud
 from dougong.errors import FormatError, InputError
 from dougong.formats import FileInfo, describe, write
@@ -149,6 +150,26 @@ def test_an_earlier_result_is_no_input_of_the_next(tmp_path):
     refuse_own_result(files, tmp_path / "elsewhere")
     with pytest.raises(InputError, match=r"clouds/a.laz is part of the result in .*another --out"):
         refuse_own_result(files, tmp_path / "out")
+
+
+def test_a_result_named_as_an_input_is_no_accident(tmp_path, capsys):
+    scan = tmp_path / "scan.laz"
+    write(Cloud.from_points(np.eye(3)), scan)
+    before = scan.read_bytes()
+    assert call(["run", "--lidar", str(scan), "--out", str(scan), "--quiet"]) == 1
+    said = capsys.readouterr().err
+    assert "scan.laz is a file, and the result is a folder. Choose another --out." in said
+    assert scan.read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["scan.laz"]
+
+
+def test_a_file_that_is_left_out_is_named_once(tmp_path):
+    write(Cloud.from_points(np.eye(3)), tmp_path / "scan.laz")
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "cut.ply").write_bytes(b"ply\n")
+    assert find_clouds(tmp_path)[1] == [
+        "old/cut.ply: the file ends inside its header. Copy it again."
+    ]
 
 
 def test_a_file_name_with_brackets_is_found_as_it_is(tmp_path):

@@ -298,6 +298,15 @@ def test_a_failing_job_leaves_nothing(folder, capsys, monkeypatch):
     assert [path for path in folder.iterdir() if "part" in path.name] == []
 
 
+def test_a_setting_that_does_not_go_with_a_cloud_names_it(folder, capsys):
+    points = np.random.default_rng(0).uniform(0, [20_000, 20_000, 5000], (5000, 3))
+    dougong.write(Cloud.from_points(points), folder / "in_mm.laz")
+    files = ("--lidar", folder / "one.laz", "--lidar", folder / "in_mm.laz")
+    code, document = run(capsys, *files, "--out", folder / "out")
+    assert code == 2
+    assert document["error"]["message"].startswith("in_mm.laz: the cloth would have")
+
+
 @pytest.mark.parametrize(
     ("tokens", "said"),
     [

@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Sequence
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, UnusedCliTokensError
 
 import dougong
 from dougong.cli import (
@@ -96,6 +96,14 @@ def call(tokens: Sequence[str]) -> int:
             print_error=False,
             result_action="return_value",
         )
+    except UnusedCliTokensError as error:
+        unused = error.unused_tokens or [""]
+        more = f" and {len(unused) - 1} more" if len(unused) > 1 else ""
+        msg = (
+            f"{unused[0]!r}{more}: more than this command takes. Quote a name with blanks, and see "
+            f"`dougong {tokens[0]} --help`."
+        )
+        return fail(InputError(msg), as_json="--json" in tokens, debug=False)
     except CycloptsError as error:
         return fail(InputError(str(error)), as_json="--json" in tokens, debug=False)
     return int(code or 0)

@@ -120,7 +120,8 @@ def find_clouds(folder: Path) -> tuple[list[Guess], list[str]]:
             info = describe(file)
             kind, why = guess_kind_of(file, info)
         except DougongError as error:
-            skipped.append(f"{inside}: {error}")
+            # The sentence names the file, not the folder that it is in.
+            skipped.append(f"{inside}: {str(error).removeprefix(f'{file.name}: ')}")
             continue
         name = _free_name(stem(file).replace("\\", "-"), (guess.name for guess in guesses))
         guesses.append(

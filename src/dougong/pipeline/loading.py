@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dougong.cloud import Cloud
+from dougong.errors import InputError
 from dougong.formats import describe, faults_of, in_system, read, read_stations
 from dougong.formats.faults import NO_SYSTEM
 from dougong.formats.model import Hold
@@ -97,7 +98,7 @@ class Loader:
             found = self._whole(entry, file, digest)
         twin = next((other for other, of in self.inputs.items() if of["sha256"] == digest), None)
         self.inputs[file] = {"path": self.shown(file), "sha256": digest, "points": 0}
-        for source in found:
+        for source in _naming(file, found):
             if twin is not None:
                 said = f"{file.name} is a copy of {twin.name}: its points are in the result twice"
                 source = replace(source, notes=(*source.notes, said))
@@ -239,3 +240,13 @@ class Loader:
             removed=removed,
             notes=(*(f"{file.name}: {note}" for note in books.noticed), *books.notes),
         )
+
+
+def _naming(file: Path, found: Iterator[Source]) -> Iterator[Source]:
+    """Yield what is found of a file; a setting that does not go with it is said with its name."""
+    try:
+        yield from found
+    except InputError as error:
+        if file.name in str(error):
+            raise
+        raise InputError(f"{file.name}: {error}") from error

@@ -291,7 +291,8 @@ def refuse_own_result(files: Sequence[Path], out: Path) -> None:
     folder = out.resolve()
     for file in files:
         place = file.resolve()
-        if place.is_relative_to(folder) and place.relative_to(folder).parts[0] in _RESULT:
+        inside = place.relative_to(folder).parts if place.is_relative_to(folder) else ()
+        if inside and inside[0] in _RESULT:
             msg = (
                 f"{file} is part of the result in {out}, expected a cloud of the survey. Choose "
                 "another --out, or a pattern that leaves the result out."
