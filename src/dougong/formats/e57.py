@@ -183,14 +183,27 @@ def open_e57(path: Path) -> list[E57Scan]:
         try:
             root = image.root()
             crs, said = _crs_of(root)
-            scans = [
-                _scan(path, root["data3D"][i], i, crs, said) for i in range(len(root["data3D"]))
+            nodes = [root["data3D"][i] for i in range(len(root["data3D"]))]
+            scans = [_scan(path, node, i, crs, said) for i, node in enumerate(nodes)]
+            unposed = [
+                scan
+                for scan, node in zip(scans, nodes, strict=True)
+                if scan.count and not node.isDefined("pose")
             ]
         except libe57.E57Exception as error:
             reason = str(error).strip().splitlines()[0]
             raise FormatError(f"{path.name} has a damaged E57 header: {reason}.") from error
     filled = [scan for scan in scans if scan.count]
     refuse_empty(len(filled), path)
+    if unposed and len(filled) > 1:
+        note = (
+            f"{len(unposed)} of the {len(filled)} scans of {path.name} "
+            f"{'state' if len(unposed) > 1 else 'states'} no pose and "
+            f"{'are' if len(unposed) > 1 else 'is'} taken to lie in the file's frame: wrongly, if "
+            "in a scanner's own. Export them registered, or let each move by itself (in a project "
+            "registered = false)."
+        )
+        unposed[0].notes += (note,)
     return filled
 
 
@@ -236,8 +249,15 @@ def _scan(path: Path, node: Any, index: int, crs: str | None, said: tuple[str, .
         msg = f"{path.name}: scan {label!r} has no coordinates, only {', '.join(fields)}."
         raise FormatError(msg)
     notes = (f"text fields were not read: {', '.join(left_out)}.",) if left_out else ()
+    pose = pose_of_node(node)
+    if pose is None:
+        msg = (
+            f"{path.name}: scan {label!r} has a pose that is none: its rotation is 0 0 0 0, "
+            "expected a quaternion. Export it again."
+        )
+        raise FormatError(msg)
     guid = str(node["guid"].value()) if node.isDefined("guid") else ""
-    header = E57Header(index, pose_of_node(node), label, guid, fields, source=path)
+    header = E57Header(index, pose, label, guid, fields, source=path)
     return E57Scan(path, label, header, int(points.childCount()), crs, (*said, *notes))
 
 
@@ -253,14 +273,19 @@ def _dtype_of(spec: FieldSpec) -> str:
     return "i8"
 
 
-def pose_of_node(node: Any) -> Pose:
-    """Return the pose of a scan or picture; without one its coordinates are the file's."""
+def pose_of_node(node: Any) -> Pose | None:
+    """Return the pose of a scan, None where its rotation is none.
+
+    Without one its coordinates are the file's.
+    """
     pose = still()
     if not node.isDefined("pose"):
         return pose
     rotation, translation = pose.rotation, pose.translation
     if node["pose"].isDefined("rotation"):
         quaternion = [float(node["pose"]["rotation"][axis].value()) for axis in "wxyz"]
+        if not any(quaternion):
+            return None
         rotation = matrix_of(np.array(quaternion))
     if node["pose"].isDefined("translation"):
         translation = np.array([float(node["pose"]["translation"][a].value()) for a in "xyz"])
