@@ -7,11 +7,15 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from dougong.cloud import Cloud
 from dougong.errors import InputError
+from dougong.formats import write
+from dougong.pipeline.provenance import sha256
 from dougong.registration.checks import checks_document
 from dougong.registration.control import Control
 from dougong.registration.control_solve import ControlPoints
-from dougong.report import build
+from dougong.report import build, rebuild
+from dougong.report.documents import replaced_inputs
 from dougong.report.drawing import View, draw_dots, draw_surface, height_colours, oblique_view
 from dougong.report.figures import find_place, overview, slices
 from dougong.report.layers import BLUE, COLOURS, Layer, rigid_inverse
@@ -19,6 +23,7 @@ from dougong.report.links import network_rows
 from dougong.report.model import flat, from_registration, from_run
 from dougong.report.plates import length_text, line_chart, plate, round_length
 from dougong.report.render import environment, render
+from dougong.report.streaming import items_of
 
 TOP = View(
     right=np.array([1.0, 0, 0]),
@@ -262,6 +267,41 @@ def test_long_names_of_parameters_break_behind_their_parts():
 def test_a_folder_without_a_result_is_one_sentence(tmp_path):
     with pytest.raises(InputError, match=r"no result\.json"):
         build(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("result.json", "{", "result.json is no JSON text: line 1, column 2: "),
+        ("result.json", "[]", "result.json holds a list, expected an object. Give the command"),
+        ("result.json", '{"clouds": 1}', "result.json has no registrations and no inputs and no"),
+        ("registration.json", "\xff", "registration.json is no UTF-8 text. Give the command"),
+        (
+            "registration.json",
+            '{"status": "ok", "matrix": 1, "source": 1, "target": 1, "inputs": []}',
+            "are not as this dougong writes them",
+        ),
+    ],
+)
+def test_a_document_that_was_changed_is_one_sentence(tmp_path, name, text, said):
+    (tmp_path / name).write_text(text, encoding="latin-1")
+    with pytest.raises(InputError) as caught:
+        rebuild(tmp_path)
+    assert said in str(caught.value)
+    assert "with --overwrite." in str(caught.value)
+    if name == "result.json":
+        with pytest.raises(InputError, match=re.escape(said)):
+            items_of([tmp_path])
+
+
+def test_an_input_that_is_another_file_by_now_is_said(tmp_path):
+    write(Cloud.from_points(np.eye(3)), tmp_path / "a.laz")
+    inputs = [{"path": str(tmp_path / "a.laz"), "sha256": sha256(tmp_path / "a.laz")}]
+    gone = {"path": str(tmp_path / "gone.laz"), "sha256": ""}
+    assert replaced_inputs({"inputs": [*inputs, gone]}) == []
+    write(Cloud.from_points(np.eye(3) + 1), tmp_path / "a.laz", overwrite=True)
+    (note,) = replaced_inputs({"inputs": inputs})
+    assert "a.laz is not the file that was registered" in note
 
 
 def test_a_registration_whose_inputs_are_gone_says_so(tmp_path):

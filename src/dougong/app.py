@@ -426,7 +426,7 @@ def bench(
 
 def report(folder: Path, *, progress: Progress) -> Document:
     """Rebuild ``report.html`` in a result folder."""
-    return {"report": str(_build_report(folder, progress))}
+    return {"report": str(_build_report(folder, progress, is_fresh=False))}
 
 
 def view(
@@ -446,12 +446,12 @@ def view(
     )
 
 
-def _build_report(folder: Path, progress: Progress) -> Path:
-    from dougong.report import build
+def _build_report(folder: Path, progress: Progress, *, is_fresh: bool = True) -> Path:
+    from dougong.report import build, rebuild
     from dougong.report.viewer import why_missing
 
     progress.stage("drawing the report")
     missing = why_missing()
     if missing is not None:
         progress.note(f"the report holds still pictures only, no 3-D view: {missing}")
-    return build(folder)
+    return build(folder) if is_fresh else rebuild(folder)

@@ -1,6 +1,5 @@
 """From a result folder to one self-contained HTML page."""
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +8,16 @@ from typing import Any
 import jinja2
 from markupsafe import Markup, escape
 
-from dougong.errors import InputError
+from dougong.errors import DougongError, InputError
 from dougong.pipeline.outputs import write_text
 from dougong.report.annex import Annex, annex_of
+from dougong.report.documents import (
+    load,
+    load_registration,
+    load_result,
+    not_as_written,
+    replaced_inputs,
+)
 from dougong.report.figures import Figure, find_place, overview, slices
 from dougong.report.layers import Layer, pair_layers, run_layers
 from dougong.report.model import Report, from_registration, from_run
@@ -20,8 +26,26 @@ from dougong.report.poses import score_chart
 from dougong.report.viewer import View3D, view_3d, why_missing
 
 
-def build(folder: Path) -> Path:
+def rebuild(folder: Path) -> Path:
+    """Write ``report.html`` anew, as `build`, from files that may have been changed since.
+
+    Raises
+    ------
+    InputError
+        The folder holds no result, or one that is not as we write it.
+    """
+    try:
+        return build(folder, is_fresh=False)
+    except DougongError:
+        raise
+    except (LookupError, TypeError, AttributeError, ValueError, jinja2.TemplateError) as error:
+        raise not_as_written(folder, error) from error
+
+
+def build(folder: Path, *, is_fresh: bool = True) -> Path:
     """Write ``report.html`` from the files in a result folder and return its path.
+
+    `is_fresh` says that they were written just now: nobody can have replaced an input since.
 
     Raises
     ------
@@ -30,14 +54,16 @@ def build(folder: Path) -> Path:
     """
     result, single = folder / "result.json", folder / "registration.json"
     if result.is_file():
-        document = load(result)
+        document = load_result(folder)
         demo = folder / "demo.json"
         layers = run_layers(folder, document)
         report = from_run(document, load(demo) if demo.is_file() else None)
     elif single.is_file():
-        document = load(single)
+        document = load_registration(folder)
         layers = pair_layers(document, folder)
         report = from_registration(document)
+        if not is_fresh:
+            report = replace(report, notes=(*report.notes, *replaced_inputs(document)))
         if not layers:
             note = "The input files are not where they were, so nothing could be drawn."
             report = replace(report, notes=(*report.notes, note))
@@ -51,12 +77,6 @@ def build(folder: Path) -> Path:
     place = find_place(layers) if layers else None
     write_text(path, render(report, layers, annex_of(folder, document, layers, place)))
     return path
-
-
-def load(path: Path) -> dict[str, Any]:
-    """Return the JSON document of a result folder."""
-    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return document
 
 
 def render(report: Report, layers: list[Layer], annex: Annex | None = None) -> str:

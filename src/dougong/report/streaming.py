@@ -1,6 +1,5 @@
 """What ``dougong view`` shows: which clouds, where each lies, and what must be converted first."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 
 from dougong.errors import InputError
 from dougong.formats import FileInfo, describe, read, write
+from dougong.report.documents import load_registration, load_result, replaced_inputs
 from dougong.report.layers import BLUE, COLOURS
 from dougong.report.looks import SIGNED_TITLE, SIGNED_WORDS, Look, look_at
 from dougong.report.payload import REACH_M
@@ -73,7 +73,7 @@ def items_of(paths: Sequence[Path]) -> tuple[list[Item], list[str]]:
         elif (path / "result.json").is_file():
             items += _merged(path, notes)
         elif (path / "registration.json").is_file():
-            items += _pair(path)
+            items += _pair(path, notes)
         else:
             msg = (
                 f"{path} holds no result.json and no registration.json. Name the --out folder of "
@@ -83,14 +83,9 @@ def items_of(paths: Sequence[Path]) -> tuple[list[Item], list[str]]:
     return items, notes
 
 
-def _load(path: Path) -> dict[str, Any]:
-    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return document
-
-
 def _merged(folder: Path, notes: list[str]) -> list[Item]:
     """Return the merged cloud of a run, then what was taken out of its clouds."""
-    result = _load(folder / "result.json")
+    result = load_result(folder)
     merged = result["merged"]
     left = [cloud["name"] for cloud in result["clouds"] if cloud["name"] not in merged["clouds"]]
     if left:
@@ -112,13 +107,14 @@ def _merged(folder: Path, notes: list[str]) -> list[Item]:
     ]
 
 
-def _pair(folder: Path) -> list[Item]:
+def _pair(folder: Path, notes: list[str]) -> list[Item]:
     """Return the two clouds of a registration, the source moved."""
-    document = _load(folder / "registration.json")
+    document = load_registration(folder)
     source, target = (Path(entry["path"]) for entry in document["inputs"])
     for path in (source, target):
         if not path.is_file():
             raise InputError(f"{path}, an input of {folder}, is not there any more.")
+    notes += replaced_inputs(document)
     if document["matrix"] is None:
         return [Item(name=document["source"], path=source)]
     matrix = np.array(document["matrix"])
