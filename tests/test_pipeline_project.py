@@ -90,6 +90,7 @@ def test_a_cloud_without_a_unit_is_no_reference(project):
         (UNSCALED + 'crs = "EPSG:32650"', "and a crs"),
         (UNSCALED + "registered = false", "registered = false: one scale"),
         (GOOD + "[[", "no valid TOML"),
+        (GOOD + 'crs = "UTM 50N?"', r"number 2, crs: 'UTM 50N\?' is no .*an EPSG code such as"),
     ],
 )
 def test_a_wrong_project_names_file_key_value_and_what_was_expected(project, text, said):
@@ -98,6 +99,11 @@ def test_a_wrong_project_names_file_key_value_and_what_was_expected(project, tex
         read_project(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_project_that_an_editor_saved_with_its_mark_is_read(tmp_path):
+    (tmp_path / "p.toml").write_text(GOOD, encoding="utf-8-sig")
+    assert read_project(tmp_path / "p.toml").reference() == "drone"
 
 
 def test_a_missing_project_says_how_to_get_one(tmp_path):

@@ -105,7 +105,10 @@ def csv_rows(path: Path, needed: Sequence[str] = COORDINATES) -> list[dict[str, 
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        msg = f"there is no file {path}. `dougong view SOURCE TARGET --pairs FILE` writes one."
+        msg = (
+            f"there is no file {path}. Name a CSV file of places; "
+            "`dougong view SOURCE TARGET --pairs FILE` writes one of picked pairs."
+        )
         raise InputError(msg) from None
     except (OSError, UnicodeDecodeError) as error:
         msg = f"{path} cannot be read as text ({error}). Give a CSV file in UTF-8."

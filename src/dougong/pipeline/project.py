@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 from dougong.errors import InputError
 from dougong.formats import SUFFIXES, scans_in
 from dougong.formats.registry import kind_of
+from dougong.formats.units import as_wkt
 from dougong.params import Parameters
 from dougong.pipeline.merging import Merge
 from dougong.pipeline.recipes import Recipe
@@ -48,6 +49,16 @@ class Entry(Parameters):
     """False: each station (E57) or file moves by itself."""
     scale_known: bool = True
     """False: the cloud's unit is not known to be the metre; then its scale is searched too."""
+
+    @field_validator("crs")
+    @classmethod
+    def _is_a_system(cls, crs: str | None) -> str | None:
+        if crs is not None and as_wkt(crs) is None:
+            msg = (
+                f"{crs!r} is no coordinate system; expected an EPSG code such as EPSG:32650, or WKT"
+            )
+            raise ValueError(msg)
+        return crs
 
 
 class Quality(Parameters):
@@ -156,7 +167,7 @@ def read_project(path: Path) -> Project:
         )
         raise InputError(msg)
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         msg = f"there is no project file {path}. `dougong init DIR` writes one."
         raise InputError(msg) from None
