@@ -240,15 +240,18 @@ def test_a_pose_that_is_none_is_refused(tmp_path):
 def test_scans_without_a_pose_beside_others_are_said(tmp_path):
     bare = [{"name": f"s{k}", "fields": cartesian(np.eye(3) + k)} for k in range(3)]
     posed = bare[0] | {"rotation": [1, 0, 0, 0], "translation": [5, 0, 0]}
+    still = posed | {"translation": [0, 0, 0]}
     path = write_e57(tmp_path / "a.e57", bare)
     (note,) = read(path).notes
-    assert note.startswith("s0: 3 of the 3 scans of a.e57 state no pose and are taken to lie in")
+    assert note.startswith("s0: 3 of the 3 scans of a.e57 state no pose, or one that moves nothing")
     assert describe(path).notes == (note.removeprefix("s0: "),)
     assert [f.severity for f in check(path) if "state no pose" in f.text] == ["warning"]
     (note,) = read(write_e57(tmp_path / "b.e57", [posed, *bare[1:2]])).notes
-    assert note.startswith("s1: 1 of the 2 scans of b.e57 states no pose and is taken")
-    assert not read(write_e57(tmp_path / "c.e57", [posed, posed])).notes
-    assert not read(write_e57(tmp_path / "d.e57", bare[:1])).notes
+    assert note.startswith("s1: 1 of the 2 scans of b.e57 states no pose, or")
+    (note,) = read(write_e57(tmp_path / "c.e57", [posed, still, still])).notes
+    assert note.startswith("s0: 2 of the 3 scans")
+    for name, scans in (("d", [posed, posed]), ("e", [still, posed]), ("f", bare[:1])):
+        assert not read(write_e57(tmp_path / f"{name}.e57", scans)).notes
 
 
 def test_an_empty_scan_beside_a_full_one(tmp_path):

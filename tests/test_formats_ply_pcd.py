@@ -6,9 +6,9 @@ import numpy as np
 import plyfile
 import pytest
 
-from dougong.cloud import Cloud
+from dougong.cloud import Cloud, Frame
 from dougong.errors import FormatError
-from dougong.formats import describe, iterate, read, write
+from dougong.formats import describe, iterate, read, reissue, write
 from dougong.kernels.lzf import unpack_lzf
 from reference.formats import unpack_lzf as slow_unpack_lzf
 
@@ -184,6 +184,8 @@ def test_what_follows_behind_lists_of_a_binary_ply_is_said(tmp_path, order, leng
     (note,) = about_the_end(mesh(path, order, b"junk" * 9, lengths=lengths))
     assert note.startswith("its header declares 3 points, wrongly: 36 bytes (of 12 a point) follow")
     assert note in describe(path).notes
+    moved = reissue(path, tmp_path / "b.laz", [np.eye(4)], Frame(), overwrite=True)
+    assert note in moved.notes
     mesh(path, order, lengths=lengths)
     path.write_bytes(path.read_bytes()[:-3])
     (note,) = about_the_end(path)

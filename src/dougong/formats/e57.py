@@ -185,26 +185,32 @@ def open_e57(path: Path) -> list[E57Scan]:
             crs, said = _crs_of(root)
             nodes = [root["data3D"][i] for i in range(len(root["data3D"]))]
             scans = [_scan(path, node, i, crs, said) for i, node in enumerate(nodes)]
-            unposed = [
-                scan
-                for scan, node in zip(scans, nodes, strict=True)
-                if scan.count and not node.isDefined("pose")
-            ]
+            has_pose = [node.isDefined("pose") for node in nodes]
         except libe57.E57Exception as error:
             reason = str(error).strip().splitlines()[0]
             raise FormatError(f"{path.name} has a damaged E57 header: {reason}.") from error
     filled = [scan for scan in scans if scan.count]
     refuse_empty(len(filled), path)
-    if unposed and len(filled) > 1:
-        note = (
-            f"{len(unposed)} of the {len(filled)} scans of {path.name} "
-            f"{'state' if len(unposed) > 1 else 'states'} no pose and "
-            f"{'are' if len(unposed) > 1 else 'is'} taken to lie in the file's frame: wrongly, if "
-            "in a scanner's own. Export them registered, or let each move by itself (in a project "
-            "registered = false)."
-        )
-        unposed[0].notes += (note,)
+    _say_unposed(filled, [scan for scan, has in zip(scans, has_pose, strict=True) if not has])
     return filled
+
+
+def _say_unposed(filled: list[E57Scan], bare: list[E57Scan]) -> None:
+    """Note of several scans which of them lie as they were scanned; `bare` ones state no pose.
+
+    One that is moved by nothing may be that in whose frame the others are; of two, one is not.
+    """
+    unmoved = [scan for scan in filled if scan in bare or scan.header.pose.is_still]
+    if len(filled) < 2 or (len(unmoved) < 2 and not any(scan in bare for scan in filled)):
+        return
+    is_one = len(unmoved) == 1
+    note = (
+        f"{len(unmoved)} of the {len(filled)} scans of {filled[0].path.name} "
+        f"{'states' if is_one else 'state'} no pose, or one that moves nothing, and "
+        f"{'is' if is_one else 'are'} taken to lie in the file's frame: wrongly, if in a scanner's "
+        "own. Export them registered, or let each move by itself (in a project registered = false)."
+    )
+    unmoved[0].notes += (note,)
 
 
 def _crs_of(root: Any) -> tuple[str | None, tuple[str, ...]]:

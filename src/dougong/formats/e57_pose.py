@@ -24,6 +24,11 @@ class Pose:
     """(3,), metres."""
 
     @property
+    def is_still(self) -> bool:
+        """Whether it moves nothing."""
+        return bool((self.rotation == np.eye(3)).all() and not self.translation.any())
+
+    @property
     def quaternion(self) -> NDArray[np.float64]:
         """(w, x, y, z) of length one, w never negative."""
         return quaternion_of(self.rotation)

@@ -129,14 +129,16 @@ def reissue(
     if kind == "las":
         from dougong.formats.las import read_las_header
 
-        header, survey = read_las_header(source), None
+        header, scans, survey = read_las_header(source), [], None
     else:
-        header, survey = None, survey_of(scans_of(source, kind), chunk_points)
+        # The same scans again: what only a whole pass finds is among their notes then.
+        header, scans = None, scans_of(source, kind)
+        survey = survey_of(scans, chunk_points)
 
     def chunks() -> Generator[Cloud]:
         if survey is None:
             yield from iterate(source, chunk_points)
         else:
-            yield from iterate_scans(scans_of(source, kind), chunk_points, survey)
+            yield from iterate_scans(scans, chunk_points, survey)
 
     return reissue_las(chunks, source, output, matrices, target, header=header, overwrite=overwrite)
