@@ -103,6 +103,19 @@ def test_coarse_steps_are_said(tmp_path):
     assert not any("every z" in text or "z in steps" in text for text in found)
 
 
+@pytest.mark.parametrize(("scale", "is_said"), [(0.001, False), (0.01, False), (0.05, True)])
+def test_a_lattice_too_coarse_for_a_building_is_said_where_a_cloud_is_used(
+    tmp_path, scale, is_said
+):
+    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    las.header.scales, las.header.offsets = [scale] * 3, np.floor(hall().min(axis=0))
+    las.x, las.y, las.z = hall().T
+    las.write(tmp_path / "a.las")
+    said = [note for note in faults_of(read(tmp_path / "a.las")) if "too coarse" in note]
+    assert bool(said) == is_said
+    assert all("in steps of 0.05 m: too coarse for a building" in note for note in said)
+
+
 def test_phantom_points_at_zero_are_found(tmp_path):
     points = hall()
     points[5:25] = 0

@@ -17,6 +17,7 @@ from dougong.cloud import Cloud, Frame
 from dougong.errors import FormatError
 from dougong.formats.describe import describe
 from dougong.formats.faults import (
+    COARSE_M,
     FEW,
     SAMPLE,
     coordinate_hashes,
@@ -33,8 +34,6 @@ from dougong.formats.units import metric_problem
 from dougong.typing import Points
 
 _CHUNK = 1_000_000
-COARSE_M = 0.01
-"""Coordinate steps from here on hide the detail of a building."""
 
 
 @dataclass

@@ -11,6 +11,8 @@ from dougong._boxes import are_within
 from dougong.cloud import Cloud, Frame
 from dougong.typing import Points
 
+COARSE_M = 0.01
+"""Coordinate steps from here on hide the detail of a building."""
 FEW = 100
 """Fewer points prove nothing about how they were stored, and hold no site."""
 SAMPLE = 200_000
@@ -148,8 +150,24 @@ def faults_in_words(
         found.append(f"{far:,} of {points:,} points lie far from all others.")
     if points < FEW:
         return (*found, f"only {counted(points)}: too few to filter or register.")
-    suspicion = unit_suspicion(sample, frame)
-    return (*found, suspicion) if suspicion else tuple(found)
+    said = unit_suspicion(sample, frame) or _coarseness(frame)
+    return (*found, said) if said else tuple(found)
+
+
+def _coarseness(frame: Frame) -> str | None:
+    """Return in words that coordinates lie on too coarse a lattice, or None.
+
+    A step of just `COARSE_M`, as many programs choose unasked, is left to `check`.
+    """
+    if frame.step is None:
+        return None
+    coarsest = max(step * unit for step, unit in zip(frame.step, frame.unit_m, strict=True))
+    if coarsest <= COARSE_M * (1 + 1e-9):
+        return None
+    return (
+        f"its coordinates are stored in steps of {coarsest:.3g} m: too coarse for a building. "
+        "Export it with steps of 0.001 m or finer."
+    )
 
 
 def counted(points: int) -> str:
