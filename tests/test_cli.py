@@ -13,9 +13,10 @@ import pytest
 import dougong
 from dougong.cli import call
 from dougong.cli._common import Common
-from dougong.cli._text import table
+from dougong.cli._text import origin, table
 from dougong.cloud import Cloud
 from dougong.errors import InputError
+from dougong.pipeline import moving
 from dougong.pipeline.provenance import sha256
 
 ROOT = Path(__file__).parents[1]
@@ -289,6 +290,23 @@ def test_a_registration_that_an_editor_saved_with_its_mark_is_read(room):
     assert call([*tokens, "--quiet"]) == 0
 
 
+@pytest.mark.parametrize(("name", "verb"), [("t.laz", "reissue"), ("t.ply", "read")])
+def test_a_file_replaced_while_it_is_moved_leaves_no_output(name, verb, room, capsys, monkeypatch):
+    path, moved = room.with_name("m.json"), room.with_name(name)
+    path.write_text(framed())
+    function = getattr(moving, verb)
+
+    def replacing(*args, **more):
+        found = function(*args, **more)
+        dougong.write(Cloud.from_points(np.eye(3)), room, overwrite=True)
+        return found
+
+    monkeypatch.setattr(moving, verb, replacing)
+    assert call(["transform", str(room), str(moved), "--matrix", str(path), "--quiet"]) == 1
+    assert "room.laz was changed or replaced while it was worked on" in capsys.readouterr().err
+    assert {file.name for file in room.parent.iterdir()} == {"room.laz", "m.json"}
+
+
 def test_a_file_that_is_not_the_registered_one_is_said(room, capsys):
     path, moved = room.with_name("m.json"), room.with_name("t.laz")
     tokens = ["transform", str(room), str(moved), "--matrix", str(path), "--overwrite", "--json"]
@@ -363,6 +381,13 @@ def test_commands_are_listed_in_the_order_of_a_survey(capsys):
 def test_tables_set_figures_flush_right():
     text = table([["a", "1"], ["bb", "1,000"]], ["name", "points"])
     assert text.splitlines() == ["  name  points", "  a          1", "  bb     1,000"]
+
+
+def test_the_screen_names_a_clouds_file_where_its_name_does_not():
+    scan = {"name": "scan", "kind": "lidar", "files": ["a/scan.copc.laz"]}
+    assert origin(scan) == "lidar"
+    assert origin(scan | {"name": "stations-2"}) == "lidar, scan.copc.laz"
+    assert origin(scan | {"files": ["a.laz", "b.laz"]}) == "lidar, 2 files"
 
 
 def test_the_documented_commands_and_options_are_the_real_ones(capsys):

@@ -1,6 +1,7 @@
 """Plain text for people: tables, counts, units."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 _MARKS = {"ok": "OK", "ambiguous": "AMBIGUOUS", "failed": "FAILED"}
@@ -133,3 +134,12 @@ def notes(document: Sequence[str]) -> str:
 def join(*parts: str) -> str:
     """Join the parts that are not empty, one below the other."""
     return "\n".join(part for part in parts if part)
+
+
+def origin(cloud: dict[str, Any]) -> str:
+    """Return the sensor of a cloud, and what it was read from where its name does not tell."""
+    names = [Path(file).name for file in cloud["files"]]
+    if len(names) > 1:
+        return f"{cloud['kind']}, {len(names)} files"
+    told = all(name.startswith(f"{cloud['name']}.") for name in names)
+    return cloud["kind"] if told else f"{cloud['kind']}, {names[0]}"

@@ -75,7 +75,7 @@ def _left_out(merged: dict[str, Any]) -> str:
 def _words(document: dict[str, Any], out: Path) -> str:
     parts = []
     for cloud in document["clouds"]:
-        parts += [f"{cloud['name']} ({cloud['kind']})", _text.stages(cloud["stages"])]
+        parts += [f"{cloud['name']} ({_text.origin(cloud)})", _text.stages(cloud["stages"])]
     parts += [_text.registration(entry) for entry in document["registrations"]]
     merged = document["merged"]
     spent = f"{document['seconds']['total']:.1f} s"

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from dougong.cloud import Frame
-from dougong.errors import FrameError
+from dougong.errors import FormatError, FrameError
 from dougong.formats import (
     can_reissue,
     describe,
@@ -19,12 +19,13 @@ from dougong.formats import (
     units_of,
     write,
 )
+from dougong.formats.stream import opened
 from dougong.formats.units import METRES
 from dougong.pipeline.memory import refuse_too_large
 from dougong.pipeline.outputs import refuse_output, watched
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import stem
-from dougong.pipeline.provenance import sha256
+from dougong.pipeline.provenance import Stamp, require_unchanged, sha256, stamp_of
 from dougong.pipeline.registrations import Known, Unit, finite, read_registration
 
 
@@ -46,11 +47,15 @@ def transform_file(
         The registration is not sure and `accept_best` is False, or the output exists.
     RegistrationError
         The registration failed: there is no pose.
+    FormatError
+        The file cannot be read, or is replaced meanwhile.
     FrameError
         The file is in degrees or earth-centred coordinates, or in other units than the matrix.
     """
     known = read_registration(matrix, accept_best=accept_best)
     refuse_output(input, output, [output], overwrite)
+    with opened(input):  # what cannot be is said as every command says it
+        stamp = stamp_of(input)
     crs, unit_m = system_in(input)
     _require_unit(input, crs, unit_m, known)
     notes = [*known.notes, *_file_notes(input, known), *_system_notes(input, crs, unit_m, known)]
@@ -82,6 +87,7 @@ def transform_file(
             notes += cloud.notes
             progress.stage(f"writing {output.name}")
             written = write(cloud.moved(known.matrix, frame), output, overwrite=overwrite)
+        _require_unchanged(input, stamp, output)
     document: dict[str, Any] = finite(
         {
             "input": str(input),
@@ -95,6 +101,21 @@ def transform_file(
         }
     )
     return document
+
+
+def _require_unchanged(input: Path, stamp: Stamp, output: Path) -> None:
+    """Take back what was made of a file that was replaced meanwhile.
+
+    Raises
+    ------
+    FormatError
+        It was: it is passed over twice, and the output may hold some of both.
+    """
+    try:
+        require_unchanged(input, stamp)
+    except FormatError:
+        output.unlink(missing_ok=True)
+        raise
 
 
 def _require_unit(input: Path, crs: str | None, unit_m: Unit | None, known: Known) -> None:
