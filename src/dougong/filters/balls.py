@@ -104,32 +104,47 @@ class ExactBalls:
         from dougong.kernels import balls
 
         points, _, boxes, _ = self._lattice
-        moments = np.zeros((len(boxes), 9), np.int64)
+        moments = np.empty((len(boxes), 10), np.int64)
         balls.node_moments(points, moments)
-        found = np.zeros(len(points))
+        found = np.empty(len(points))
 
-        def task(first: int, last: int) -> None:
-            balls.ball_variation(points, boxes, moments, self._radius2, first, last, found)
+        def keep(first: int, last: int, sums: Index) -> None:
+            balls.variations(sums, found[first:last])
 
-        if len(points):
-            for_blocks(len(boxes) // 2, _LEAVES, task)
+        self._sum_up(moments, np.zeros(0, np.int64), keep)
         return found
 
     def totals(self, steps: Index) -> Index:
         """See `Balls`."""
         from dougong.kernels import balls
 
-        points, _, boxes, _ = self._lattice
-        sums = np.zeros((len(boxes), 3), np.int64)
-        balls.node_sums(steps, sums)
-        found = np.zeros((len(points), 3), np.int64)
+        sums_of_nodes = np.empty((len(self._lattice.boxes), 3), np.int64)
+        balls.node_sums(steps, sums_of_nodes)
+        found = np.empty((len(self._lattice.points), 3), np.int64)
 
-        def task(first: int, last: int) -> None:
-            balls.ball_totals(points, boxes, steps, sums, self._radius2, first, last, found)
+        def keep(first: int, last: int, sums: Index) -> None:
+            found[first:last] = sums
 
-        if len(points):
-            for_blocks(len(boxes) // 2, _LEAVES, task)
+        self._sum_up(sums_of_nodes, steps, keep)
         return found
+
+    def _sum_up(self, nodes: Index, values: Index, keep: Callable[[int, int, Index], None]) -> None:
+        """Hand to `keep` the sums (.., w) over the balls of points first .. last - 1."""
+        from dougong.kernels import balls
+
+        points, _, boxes, _ = self._lattice
+        n, leaves = len(points), len(boxes) // 2
+
+        def task(first_leaf: int, last_leaf: int) -> None:
+            first, last = first_leaf * n // leaves, last_leaf * n // leaves
+            sums = np.empty((last - first, nodes.shape[1]), np.int64)
+            balls.ball_sums(
+                points, values, boxes, nodes, self._radius2, first_leaf, last_leaf, sums
+            )
+            keep(first, last, sums)
+
+        if n:
+            for_blocks(leaves, _LEAVES, task)
 
 
 class CellBalls:

@@ -7,6 +7,14 @@ import numpy as np
 from dougong.kernels._arrays import Floats, Ints, Small
 from dougong.kernels._jit import kernel
 
+_STEPS = 12
+"""Of Newton's, at most: more are not worth it."""
+_STEP = 1e-10
+"""After one that is shorter than this, what is left is less than a rounding: it is squared."""
+_SLOPE = 1e-3
+"""Of the polynomial at its first root, at least: its rounding, 1e-16, shifts the root by so much
+less than 1e-12."""
+
 
 @kernel
 def add_products(x: np.int64, y: np.int64, z: np.int64, out: Ints) -> None:
@@ -71,6 +79,30 @@ def eigen3(a: Floats, v: Floats) -> tuple[int, int, int]:
     if a[small, small] > a[middle, middle]:
         small, middle = middle, small
     return small, middle, large
+
+
+@kernel
+def least_share(a: Floats, total: float) -> float:
+    """Return the least eigenvalue of the symmetric a (3, 3), none < 0, as a share of their `total`.
+
+    Newton's steps on the characteristic polynomial, from 0 up to its first root: to 1e-13 where the
+    others are well apart from it, as on a surface. -1 where they are not, such as along a line.
+    """
+    xx, yy, zz = a[0, 0] / total, a[1, 1] / total, a[2, 2] / total
+    xy, xz, yz = a[0, 1] / total, a[0, 2] / total, a[1, 2] / total
+    minor_x, minor_y, minor_z = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
+    minors = minor_x + minor_y + minor_z
+    determinant = xx * minor_x - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    root = 0.0
+    for _ in range(_STEPS):
+        slope = (3.0 * root - 2.0) * root + minors
+        if slope < _SLOPE:
+            return -1.0
+        step = (((root - 1.0) * root + minors) * root - determinant) / slope
+        root -= step
+        if abs(step) < _STEP:
+            return float(max(root, 0.0))
+    return -1.0
 
 
 @kernel
