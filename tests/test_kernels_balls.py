@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dougong.filters.balls import CellBalls, ExactBalls, build_lattice
-from dougong.kernels import balls
+from dougong.kernels import balls, least_weighted
 from dougong.kernels.ball_walk import CHUNK
 from dougong.kernels.moments import least_share
 
@@ -34,7 +34,9 @@ def test_moments_and_totals_are_those_of_brute_force(count):
     sums, none = np.empty((count, 10), np.int64), np.zeros(0, np.int64)
     leaves, radius2 = len(lattice.boxes) // 2, (RADIUS_M / STEP) ** 2
     balls.ball_sums(points, none, lattice.boxes, nodes, radius2, 0, leaves, sums)
-    totals = ExactBalls(lattice, RADIUS_M).totals(steps)
+    totals, nodes = np.empty((count, 3), np.int64), np.empty((len(lattice.boxes), 3), np.int64)
+    balls.node_sums(steps, nodes)
+    balls.ball_sums(points, steps, lattice.boxes, nodes, radius2, 0, leaves, totals)
     for i in range(0, count, 1 + count // 50):
         is_in = inside(points, i)
         x, y, z = (points[is_in] - points[i]).astype(np.int64).T
@@ -50,26 +52,42 @@ def test_a_rim_of_more_leaves_than_are_held_at_once_is_summed_too():
     points = np.random.default_rng(3).random((60_000, 3)) * 0.8
     lattice = build_lattice(points, RADIUS_M)
     assert len(lattice.boxes) // 2 > 4 * CHUNK
-    ones = np.ones(len(points), np.int64)
-    totals = ExactBalls(lattice, RADIUS_M).totals(ones)
+    steps = np.arange(len(points)) % 1000
+    mean, deviation = ExactBalls(lattice, RADIUS_M).statistics(steps)
     for i in range(0, len(points), 3001):
-        assert totals[i, 0] == inside(lattice.points, i).sum()
+        there = steps[inside(lattice.points, i)]
+        assert mean[i] == there.sum() / len(there)
+        assert deviation[i] == pytest.approx(there.std(), rel=1e-9)
 
 
 def test_cells_give_one_sum_to_all_their_points_in_any_part():
     points = sheet(6000, 4)
     steps = np.random.default_rng(5).integers(0, 1000, len(points))
     lattice = build_lattice(points, RADIUS_M)
-    totals = CellBalls(lattice, RADIUS_M).totals(steps[lattice.order])
+    means = CellBalls(lattice, RADIUS_M).statistics(steps[lattice.order])[0]
     near = np.flatnonzero((points[:, 0] > 0.2) & (points[:, 0] < 0.9))
     part = build_lattice(points[near], RADIUS_M)
-    again = CellBalls(part, RADIUS_M).totals(steps[near][part.order])
-    whole = np.empty_like(totals)
-    whole[lattice.order] = totals
+    again = CellBalls(part, RADIUS_M).statistics(steps[near][part.order])[0]
+    whole, parted = lattice.unsorted(means), part.unsorted(again)
     deep = (points[near, 0] > 0.54) & (points[near, 0] < 0.56)
-    parted = np.empty_like(again)
-    parted[part.order] = again
     np.testing.assert_array_equal(parted[deep], whole[near][deep])
+
+
+@pytest.mark.parametrize("count", [1, 2, 40, 3000])
+def test_the_least_weighted_distance_is_that_of_brute_force(count):
+    given_points, rng = sheet(count, 7), np.random.default_rng(8)
+    given_points[count // 2 :: 3] = given_points[0]
+    lattice = build_lattice(given_points, RADIUS_M)
+    points = lattice.points
+    weights, radii = rng.uniform(1.0, 3.0, count), rng.uniform(0.0, 0.3 / STEP, count)
+    found = np.empty(count)
+    leaves = len(lattice.boxes) // 2
+    least_weighted.least_weighted(points, lattice.boxes, weights, radii, 0, leaves, found)
+    for i in range(0, count, 1 + count // 200):
+        d2 = ((points - points[i]) ** 2).sum(axis=1)
+        is_other = (d2 <= radii[i] ** 2) & (np.arange(count) != i)
+        expected = np.sqrt((d2 * weights * weights)[is_other].min(initial=np.inf))
+        assert found[i] == expected
 
 
 @settings(max_examples=200, deadline=None)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _LEAVES = 1 << 9
 """Leaves per task; a power of two."""
 _CELLS_AT_ONCE = 1 << 13
+_POINTS_AT_ONCE = 1 << 16
 _LATTICE_STEPS = 1 << 16
 """At least this many lattice steps in the largest radius: 8 micrometres for 0.3 m."""
 _CELLS = 16
@@ -63,18 +64,25 @@ def build_lattice(points: ArrayLike, radius_m: float) -> Lattice:
     InputError
         The points spread over more than 2**52 steps.
     """
-    from dougong.filters.neighbourhood import build_index
+    from dougong.filters.neighbourhood import sort_into_index
 
     xyz = as_points(points)
     step_m = 2.0 ** math.floor(math.log2(radius_m / _LATTICE_STEPS))
-    steps = np.rint(xyz / step_m)
-    if len(xyz) and np.abs(steps).max() > 2**52:
+    steps = np.empty_like(xyz)
+
+    def task(start: int, stop: int) -> None:
+        # To multiply by a power of two is to divide by one, and faster.
+        np.rint(xyz[start:stop] * (1.0 / step_m), out=steps[start:stop])
+
+    for_blocks(len(xyz), _POINTS_AT_ONCE, task)
+    lattice = Lattice(*sort_into_index(steps), step_m)
+    if len(xyz) and np.abs(lattice.boxes[1]).max() > 2**52:
         msg = (
             f"points reach {np.abs(xyz).max():.3g} m from the local origin, too far for balls of "
             f"{radius_m} m (at most {2**52 * step_m:.3g} m). Move the origin or drop far points."
         )
         raise InputError(msg)
-    return Lattice(*build_index(steps), step_m)
+    return lattice
 
 
 class Balls(Protocol):
@@ -84,8 +92,8 @@ class Balls(Protocol):
         """Return the surface variation (n,) of every ball, in sorted order (eq. 1 to 3)."""
         ...
 
-    def totals(self, steps: Index) -> Index:
-        """Return count, sum and sum of squares (n, 3) of the `steps` (n,) >= 0 in every ball."""
+    def statistics(self, steps: Index) -> tuple[Values, Values]:
+        """Return mean and deviation (n,) of the `steps` (n,) >= 0 in every ball."""
         ...
 
 
@@ -114,19 +122,19 @@ class ExactBalls:
         self._sum_up(moments, np.zeros(0, np.int64), keep)
         return found
 
-    def totals(self, steps: Index) -> Index:
+    def statistics(self, steps: Index) -> tuple[Values, Values]:
         """See `Balls`."""
         from dougong.kernels import balls
 
-        sums_of_nodes = np.empty((len(self._lattice.boxes), 3), np.int64)
-        balls.node_sums(steps, sums_of_nodes)
-        found = np.empty((len(self._lattice.points), 3), np.int64)
+        nodes = np.empty((len(self._lattice.boxes), 3), np.int64)
+        balls.node_sums(steps, nodes)
+        mean, deviation = np.empty((2, len(self._lattice.points)))
 
         def keep(first: int, last: int, sums: Index) -> None:
-            found[first:last] = sums
+            mean[first:last], deviation[first:last] = _mean_and_deviation(sums)
 
-        self._sum_up(sums_of_nodes, steps, keep)
-        return found
+        self._sum_up(nodes, steps, keep)
+        return mean, deviation
 
     def _sum_up(self, nodes: Index, values: Index, keep: Callable[[int, int, Index], None]) -> None:
         """Hand to `keep` the sums (.., w) over the balls of points first .. last - 1."""
@@ -161,7 +169,7 @@ class CellBalls:
         self._edge = 2.0 ** math.floor(math.log2(radius / _CELLS))
         self._radius2 = (radius / self._edge) ** 2
         self._points = lattice.points
-        self._cells, self._places, self._starts = _cells_of(lattice.points, self._edge)
+        self._cells, self._places, self._starts = _cells_of(lattice, self._edge)
 
     def variation(self) -> Values:
         """See `Balls`."""
@@ -176,17 +184,17 @@ class CellBalls:
         self._sum_up(10, partial(ball_cells.cell_moments, self._points), keep)
         return self._of_points(found)
 
-    def totals(self, steps: Index) -> Index:
+    def statistics(self, steps: Index) -> tuple[Values, Values]:
         """See `Balls`."""
         from dougong.kernels import ball_cells
 
-        found = np.empty((len(self._cells.points), 3), np.int64)
+        mean, deviation = np.empty((2, len(self._cells.points)))
 
         def keep(first: int, last: int, sums: Index) -> None:
-            found[first:last] = sums
+            mean[first:last], deviation[first:last] = _mean_and_deviation(sums)
 
         self._sum_up(3, partial(ball_cells.cell_totals, steps), keep)
-        return self._of_points(found)
+        return self._of_points(mean), self._of_points(deviation)
 
     def _sum_up(
         self,
@@ -218,25 +226,40 @@ class CellBalls:
         if m:
             for_blocks(leaves, _LEAVES, task)
 
-    def _of_points(self, of_cells: NDArray[Any]) -> NDArray[Any]:
-        """Return the values (n, ..) of the points by those (m, ..) of the cells they lie in."""
-        of_runs = np.empty_like(of_cells)
-        of_runs[self._cells.order] = of_cells
-        found = np.empty((len(self._points), *of_cells.shape[1:]), of_cells.dtype)
-        found[self._places] = np.repeat(of_runs, np.diff(self._starts), axis=0)
+    def _of_points(self, of_cells: Values) -> Values:
+        """Return the values (n,) of the points by those (m,) of the cells they lie in."""
+        from dougong.kernels import ball_cells
+
+        found = np.empty(len(self._points))
+
+        def task(first: int, last: int) -> None:
+            ball_cells.spread(
+                of_cells, self._places, self._starts, self._cells.order, first, last, found
+            )
+
+        for_blocks(len(of_cells), _CELLS_AT_ONCE, task)
         return found
 
 
-def _cells_of(points: NDArray[np.float64], edge: float) -> tuple[Neighbourhood, Index, Index]:
+def _mean_and_deviation(totals: Index) -> tuple[Values, Values]:
+    """Return mean and deviation (n,) of what has count, sum and sum of squares `totals` (n, 3)."""
+    count = np.maximum(totals[:, 0], 1).astype(np.float64)
+    mean = totals[:, 1] / count
+    spread = totals[:, 2] / count - mean * mean
+    return mean, np.sqrt(np.maximum(spread, 0.0))
+
+
+def _cells_of(lattice: Lattice, edge: float) -> tuple[Neighbourhood, Index, Index]:
     """Return the cells of `edge` steps that hold points, as a tree, and whose points they are.
 
     The tree's points are whole numbers of cells. The points of the cell whose ``order`` is r are
     places[starts[r]:starts[r + 1]].
     """
-    from dougong.filters.neighbourhood import build_index
+    from dougong.filters.neighbourhood import build_index, sort_into_index
 
+    points = lattice.points
     if not len(points):
         return build_index(points), np.zeros(0, np.int64), np.zeros(1, np.int64)
-    low = np.floor(points.min(axis=0) / edge) * edge
+    low = np.floor(lattice.boxes[1, :3] / edge) * edge
     places, starts = runs_of_cells(points, low, edge)
-    return build_index(np.floor(points[places[starts[:-1]]] / edge)), places, starts
+    return sort_into_index(np.floor(points[places[starts[:-1]]] / edge)), places, starts

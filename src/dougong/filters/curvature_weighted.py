@@ -4,7 +4,8 @@ METHOD.md 1.3, equations 1 to 6, in the readings that can work. Kernels are impo
 """
 
 import math
-from typing import Annotated, Literal, NamedTuple
+from collections.abc import Callable
+from typing import Annotated, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,10 +23,14 @@ from dougong.params import Parameters
 from dougong.threads import for_blocks
 from dougong.typing import Index, Mask, Values
 
+Scalar = TypeVar("Scalar", bound=np.generic)
+
 KIND: Literal["local", "two-pass", "global"] = "local"
 
-_BLOCK = 1 << 13
+_BLOCK = 1 << 16
 """Points per task."""
+_LEAVES = 1 << 10
+"""Leaves per task."""
 _STATISTIC_STEPS = 1 << 20
 """Steps that the largest possible statistic is divided into before it is summed."""
 
@@ -117,27 +122,32 @@ def halo_m(params: CurvatureWeighted) -> float:
 
 def least_weighted_distance(lattice: Lattice, curvature: Values, p: CurvatureWeighted) -> Values:
     """Return the statistic m (n,), metres, in sorted order: eq. 5's least one; inf if none."""
-    from dougong.kernels import balls
+    from dougong.kernels import least_weighted
 
-    n = len(lattice.points)
-    weight = p.weight(curvature)
-    radii = p.radius_m(curvature) / lattice.step_m
-    least = np.empty(n)
+    weight = in_blocks(p.weight, curvature)
+    radii = in_blocks(lambda part: p.radius_m(part) / lattice.step_m, curvature)
+    least = np.empty(len(curvature))
+
+    def task(first: int, last: int) -> None:
+        least_weighted.least_weighted(
+            lattice.points, lattice.boxes, weight, radii, first, last, least
+        )
+
+    if len(least):
+        for_blocks(len(lattice.boxes) // 2, _LEAVES, task)
+    return in_blocks(lambda part: part * lattice.step_m, least)
+
+
+def in_blocks(function: Callable[..., NDArray[Scalar]], *values: Values) -> NDArray[Scalar]:
+    """Return function(*values) (n,), where each depends on its own values only, on the threads."""
+    n = len(values[0])
+    found = np.empty(n, function(*(part[:0] for part in values)).dtype)
 
     def task(start: int, stop: int) -> None:
-        balls.least_weighted(lattice.points, lattice.boxes, weight, radii, start, stop, least)
+        found[start:stop] = function(*(part[start:stop] for part in values))
 
     for_blocks(n, _BLOCK, task)
-    return least * lattice.step_m
-
-
-def _local_statistics(balls: Balls, steps: Index) -> tuple[Values, Values]:
-    """Return mean and deviation (n,) of the `steps` >= 0 (n,) in each point's ball."""
-    totals = balls.totals(steps)
-    count = np.maximum(totals[:, 0], 1).astype(np.float64)
-    mean = totals[:, 1] / count
-    spread = totals[:, 2] / count - mean * mean
-    return mean, np.sqrt(np.maximum(spread, 0.0))
+    return found
 
 
 class _Judged(NamedTuple):
@@ -156,10 +166,19 @@ class _Judged(NamedTuple):
 
         An empty neighbourhood is an outlier, its margin infinite.
         """
-        cut = self.mean + p.tau(self.curvature) * self.deviation
-        is_outlier: Mask = self.is_alone | (self.steps > cut)
-        # Half a step holds up a cut of zero, where all points are duplicates.
-        margin = np.where(self.is_alone, np.inf, self.steps / np.maximum(cut, 0.5))
+        n = len(self.steps)
+        mean, deviation = np.broadcast_to(self.mean, n), np.broadcast_to(self.deviation, n)
+        is_outlier, margin = np.empty(n, bool), np.empty(n)
+
+        def task(start: int, stop: int) -> None:
+            part = slice(start, stop)
+            cut = mean[part] + p.tau(self.curvature[part]) * deviation[part]
+            is_outlier[part] = self.is_alone[part] | (self.steps[part] > cut)
+            # Half a step holds up a cut of zero, where all points are duplicates.
+            ratio = self.steps[part] / np.maximum(cut, 0.5)
+            margin[part] = np.where(self.is_alone[part], np.inf, ratio)
+
+        for_blocks(n, _BLOCK, task)
         return is_outlier, margin
 
 
@@ -172,11 +191,13 @@ def _judge(points: ArrayLike, p: CurvatureWeighted, totals: Totals | None = None
     least = least_weighted_distance(lattice, curvature, p)
     is_alone = ~np.isfinite(least)
     step_m = p.radius_max_m * (1.0 + p.alpha) / _STATISTIC_STEPS
-    steps = np.where(is_alone, -1.0, np.rint(least / step_m)).astype(np.int64)
+    steps = in_blocks(
+        lambda part: np.where(part < np.inf, np.rint(part / step_m), -1.0).astype(np.int64), least
+    )
     if p.rule == "global":
         totals = totals or Totals.of(steps[~is_alone])
         return _Judged(lattice, curvature, is_alone, steps, totals.mean, totals.deviation)
-    return _Judged(lattice, curvature, is_alone, steps, *_local_statistics(balls, steps))
+    return _Judged(lattice, curvature, is_alone, steps, *balls.statistics(steps))
 
 
 def own_totals(points: ArrayLike, p: CurvatureWeighted, own: int) -> Totals:

@@ -101,7 +101,11 @@ def _sort_crowded(points: Points, places: Index, starts: Index) -> None:
 
 def build_index(points: ArrayLike) -> Neighbourhood:
     """Return an index over `points` (n, 3) metres. O(n log n), about 45 bytes per point."""
-    ordered = as_points(points).copy()
+    return sort_into_index(as_points(points).copy())
+
+
+def sort_into_index(ordered: Points) -> Neighbourhood:
+    """Return an index over the points `ordered` (n, 3), finite, which are sorted in place."""
     n = len(ordered)
     places = np.arange(n, dtype=np.int64)
     leaves = 1
@@ -109,15 +113,18 @@ def build_index(points: ArrayLike) -> Neighbourhood:
         leaves *= 2
     boxes = np.full((2 * leaves, 6), np.inf)
     top = min(leaves, _SUBTREES)
-    if top > 1:
-        boxtree.split(ordered, places, boxes, 1, top)
 
-    def task(first: int, last: int) -> None:
-        for node in range(top + first, top + last):
-            boxtree.split(ordered, places, boxes, node, 2 * leaves)
+    def split(level: int, below: int) -> None:
+        def task(first: int, last: int) -> None:
+            for node in range(level + first, level + last):
+                boxtree.split(ordered, places, boxes, node, below)
+
+        for_blocks(level, 1, task)
 
     if n:
-        for_blocks(top, 1, task)
+        for depth in range(top.bit_length() - 1):
+            split(1 << depth, 2 << depth)
+        split(top, 2 * leaves)
     return Neighbourhood(ordered, places, boxes)
 
 

@@ -123,6 +123,11 @@ def summing_kernel(func: Callable[P, R]) -> Callable[P, R]:
     return _compile(func, fastmath=_REASSOCIATE)
 
 
+def least_kernel(func: Callable[P, R]) -> Callable[P, R]:
+    """Compile a kernel that takes the least of numbers, none of them NaN, in any order."""
+    return _compile(func, fastmath={"nnan", "nsz"})
+
+
 def is_warm() -> bool:
     """Say whether compiled kernels of this version are in the cache already."""
     folder = cache_root() / "kernels"

@@ -68,6 +68,16 @@ def cell_totals(
 
 
 @kernel
+def spread(
+    of_cells: Floats, places: Ints, starts: Ints, runs: Ints, first: int, last: int, out: Floats
+) -> None:
+    """Fill out (n,) at the points of cells first .. last - 1 with the values of_cells (m,)."""
+    for c in range(first, last):
+        for k in range(starts[runs[c]], starts[runs[c] + 1]):
+            out[places[k]] = of_cells[c]
+
+
+@kernel
 def add_up(cells: Ints, nodes: Ints) -> None:
     """Fill nodes (2 leaves, w) with the sums over every node of those of its cells (m, w)."""
     m, leaves = cells.shape[0], nodes.shape[0] // 2

@@ -28,7 +28,6 @@ from dougong.kernels.ball_walk import (
 )
 from dougong.kernels.boxtree import LEAF
 from dougong.kernels.moments import add_products, eigen3, least_share
-from dougong.kernels.neighbours import DEPTH, next_leaf
 
 _WIDTH = 32
 """Columns are filled up to multiples of this, so that vectorised loops over them have no rest."""
@@ -337,44 +336,3 @@ def variation_of(sums: Ints, a: Floats, v: Floats) -> float:
         least = max(a[small, small], 0.0)
         share = least / (least + max(a[middle, middle], 0.0) + max(a[large, large], 0.0))
     return share
-
-
-@kernel
-def least_weighted(
-    points: Floats,
-    boxes: Floats,
-    weights: Floats,
-    radii: Floats,
-    start: int,
-    stop: int,
-    out: Floats,
-) -> None:
-    """Fill out (n,): least weights[j] x distance over j != i within radii[i] of sorted point i.
-
-    weights (n,), at least 1, so that distance bounds the product from below; radii (n,) inclusive.
-    Inf where no other point is in reach. Duplicates of a point are others.
-    """
-    n = points.shape[0]
-    leaves = boxes.shape[0] // 2
-    stack = np.empty(DEPTH, np.int64)
-    bound = np.empty(DEPTH, np.float64)
-    for q in range(start, stop):
-        x, y, z = points[q, 0], points[q, 1], points[q, 2]
-        radius2 = radii[q] * radii[q]
-        best2 = np.inf
-        stack[0] = 1
-        bound[0] = 0.0
-        height = 1
-        while True:
-            limit2 = min(best2, radius2)
-            leaf, height = next_leaf(boxes, x, y, z, limit2, stack, bound, height)
-            if leaf < 0:
-                break
-            for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
-                dx = points[i, 0] - x
-                dy = points[i, 1] - y
-                dz = points[i, 2] - z
-                d2 = dx * dx + dy * dy + dz * dz
-                if d2 <= radius2 and i != q:
-                    best2 = min(best2, d2 * weights[i] * weights[i])
-        out[q] = np.sqrt(best2)

@@ -87,7 +87,7 @@ def _gap2(boxes: Floats, a: int, b: int) -> float:
 
 
 @kernel
-def _gather(
+def gather_near(
     points: Floats, boxes: Floats, asked: int, reach2: float, stack: Ints, near: Floats, who: Ints
 ) -> int:
     """Fill near (3, ..) and who (..) with the points of leaves within reach of leaf node `asked`.
@@ -322,6 +322,6 @@ def self_knn(
             if i == first:
                 reach2 = _reach2(points, i, begin, end, known_m[i - begin], max_distance2)
                 if reach2 < np.inf:
-                    held = _gather(
+                    held = gather_near(
                         points, boxes, leaves + leaf, reach2, stack, near.points, near.who
                     )
