@@ -120,46 +120,63 @@ def halo_m(params: CurvatureWeighted) -> float:
     return 2.0 * params.radius_init_m * (1.0 + blur) + params.radius_max_m
 
 
-def least_weighted_distance(lattice: Lattice, curvature: Values, p: CurvatureWeighted) -> Values:
-    """Return the statistic m (n,), metres, in sorted order: eq. 5's least one; inf if none."""
-    from dougong.kernels import least_weighted
+def least_weighted_steps(lattice: Lattice, curvature: Values, p: CurvatureWeighted) -> Index:
+    """Return the statistic m (n,), eq. 5's least one, in sorted order; -1 where there is none.
 
+    In whole steps: a `_STATISTIC_STEPS`-th of the largest that is possible.
+    """
+    from dougong.kernels.least_weighted import least_weighted
+
+    points, _, boxes, lattice_step_m = lattice
+    n, leaves = len(points), len(boxes) // 2
     weight = in_blocks(p.weight, curvature)
-    radii = in_blocks(lambda part: p.radius_m(part) / lattice.step_m, curvature)
-    least = np.empty(len(curvature))
+    scale = lattice_step_m * _STATISTIC_STEPS / (p.radius_max_m * (1.0 + p.alpha))
+    steps = np.empty(n, np.int64)
 
-    def task(first: int, last: int) -> None:
-        least_weighted.least_weighted(
-            lattice.points, lattice.boxes, weight, radii, first, last, least
-        )
+    def task(first_leaf: int, last_leaf: int) -> None:
+        first, last = first_leaf * n // leaves, last_leaf * n // leaves
+        radii = p.radius_m(curvature[first:last]) / lattice_step_m
+        least = np.empty(last - first)
+        least_weighted(points, boxes, weight, radii, first_leaf, last_leaf, least)
+        steps[first:last] = np.where(least < np.inf, np.rint(least * scale), -1.0)
 
-    if len(least):
-        for_blocks(len(lattice.boxes) // 2, _LEAVES, task)
-    return in_blocks(lambda part: part * lattice.step_m, least)
+    if n:
+        for_blocks(leaves, _LEAVES, task)
+    return steps
 
 
-def in_blocks(function: Callable[..., NDArray[Scalar]], *values: Values) -> NDArray[Scalar]:
-    """Return function(*values) (n,), where each depends on its own values only, on the threads."""
-    n = len(values[0])
-    found = np.empty(n, function(*(part[:0] for part in values)).dtype)
+def in_blocks(function: Callable[[Values], Values], values: Values) -> Values:
+    """Return function(values) (n,), where each depends on its own value only, on the threads."""
+    found = np.empty_like(values)
 
     def task(start: int, stop: int) -> None:
-        found[start:stop] = function(*(part[start:stop] for part in values))
+        found[start:stop] = function(values[start:stop])
 
-    for_blocks(n, _BLOCK, task)
+    for_blocks(len(values), _BLOCK, task)
     return found
 
 
 class _Judged(NamedTuple):
     """What eq. 1 to 5 say of n points, in sorted order, and what is usual round each."""
 
-    lattice: Lattice
+    order: Index
+    """(n,) place in the caller's array of each."""
     curvature: Values
-    is_alone: Mask
     steps: Index
     """(n,) the statistic m in whole steps; -1 where alone."""
     mean: Values | float
     deviation: Values | float
+
+    @property
+    def is_alone(self) -> Mask:
+        """Which (n,) have no other point in reach."""
+        return self.steps < 0
+
+    def unsorted(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Return `values` (n,), given in sorted order, in the caller's order."""
+        result = np.empty_like(values)
+        result[self.order] = values
+        return result
 
     def verdict(self, p: CurvatureWeighted) -> tuple[Mask, Values]:
         """Return the verdict (n,) of eq. 6 and its margin (n,), m as a share of the cut.
@@ -172,11 +189,11 @@ class _Judged(NamedTuple):
 
         def task(start: int, stop: int) -> None:
             part = slice(start, stop)
+            steps = self.steps[part]
             cut = mean[part] + p.tau(self.curvature[part]) * deviation[part]
-            is_outlier[part] = self.is_alone[part] | (self.steps[part] > cut)
+            is_outlier[part] = (steps < 0) | (steps > cut)
             # Half a step holds up a cut of zero, where all points are duplicates.
-            ratio = self.steps[part] / np.maximum(cut, 0.5)
-            margin[part] = np.where(self.is_alone[part], np.inf, ratio)
+            margin[part] = np.where(steps < 0, np.inf, steps / np.maximum(cut, 0.5))
 
         for_blocks(n, _BLOCK, task)
         return is_outlier, margin
@@ -188,22 +205,17 @@ def _judge(points: ArrayLike, p: CurvatureWeighted, totals: Totals | None = None
     kind = CellBalls if p.balls == "fast" else ExactBalls
     balls: Balls = kind(lattice, p.radius_init_m)
     curvature = balls.variation()
-    least = least_weighted_distance(lattice, curvature, p)
-    is_alone = ~np.isfinite(least)
-    step_m = p.radius_max_m * (1.0 + p.alpha) / _STATISTIC_STEPS
-    steps = in_blocks(
-        lambda part: np.where(part < np.inf, np.rint(part / step_m), -1.0).astype(np.int64), least
-    )
+    steps = least_weighted_steps(lattice, curvature, p)
     if p.rule == "global":
-        totals = totals or Totals.of(steps[~is_alone])
-        return _Judged(lattice, curvature, is_alone, steps, totals.mean, totals.deviation)
-    return _Judged(lattice, curvature, is_alone, steps, *balls.statistics(steps))
+        totals = totals or Totals.of(steps[steps >= 0])
+        return _Judged(lattice.order, curvature, steps, totals.mean, totals.deviation)
+    return _Judged(lattice.order, curvature, steps, *balls.statistics(steps))
 
 
 def own_totals(points: ArrayLike, p: CurvatureWeighted, own: int) -> Totals:
     """Return what the first `own` of `points` add to the statistics of rule ``global``."""
     found = _judge(points, p)
-    return Totals.of(found.steps[(found.lattice.order < own) & ~found.is_alone])
+    return Totals.of(found.steps[(found.order < own) & ~found.is_alone])
 
 
 def excess(points: ArrayLike, params: CurvatureWeighted | None = None) -> Values:
@@ -215,7 +227,7 @@ def excess(points: ArrayLike, params: CurvatureWeighted | None = None) -> Values
     found = _judge(points, p)
     swing = np.maximum(p.tau(found.curvature) * found.deviation, 1e-9)
     above = np.where(found.is_alone, np.inf, (found.steps - found.mean) / swing)
-    return found.lattice.unsorted(above)
+    return found.unsorted(above)
 
 
 def curvature_weighted(
@@ -262,18 +274,16 @@ def curvature_weighted(
     if p.rule == "protective":
         return _protective(points, p, voxel_count, beside)
     found = _judge(points, p, whole)
-    lattice = found.lattice
-    n = len(lattice.points)
+    n = len(found.order)
     is_outlier, margin = found.verdict(p)
-    is_kept = np.empty(n, bool)
-    is_kept[lattice.order] = ~is_outlier
+    is_kept = found.unsorted(~is_outlier)
     if n and p.solid_voxel_count is not None:
         is_kept |= _is_solid(voxel_count, n, p.solid_voxel_count)
     return Selection(
         is_kept=is_kept,
         attributes={
-            "curvature": lattice.unsorted(found.curvature),
-            "removal_margin": lattice.unsorted(margin),
+            "curvature": found.unsorted(found.curvature),
+            "removal_margin": found.unsorted(margin),
         },
     )
 

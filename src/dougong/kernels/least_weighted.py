@@ -81,32 +81,35 @@ def least_weighted(
     last_leaf: int,
     out: Floats,
 ) -> None:
-    """Fill out (n,) at the sorted points of leaves first_leaf .. last_leaf - 1.
+    """Fill out (m,) at the sorted points of leaves first_leaf .. last_leaf - 1.
 
-    With the least weights[j] x distance over j != i within radii[i] of point i. weights (n,), at
-    least 1, so that distance bounds the product from below; radii (n,) inclusive. Inf where no
-    other point is in reach. Duplicates of a point are others.
+    With the least weights[j] x distance over j != i within the radius of point i. weights (n,), at
+    least 1, so that distance bounds the product from below; radii (m,) inclusive, those of the
+    points asked about. Inf where no other point is in reach. Duplicates of a point are others.
     """
     n, leaves = points.shape[0], boxes.shape[0] // 2
     stack, bound = np.empty(DEPTH, np.int64), np.empty(DEPTH, np.float64)
     near, given = np.empty((3, _MOST), np.float64), np.empty(_MOST, np.float64)
     who = np.empty(_MOST, np.int64)
+    offset = first_leaf * n // leaves
     for leaf in range(first_leaf, last_leaf):
         begin, end = leaf * n // leaves, (leaf + 1) * n // leaves
         reach2 = 0.0
         for q in range(begin, end):
-            radius2 = radii[q] * radii[q]
-            out[q] = _best_of(points, weights, begin, end, q, radius2)
-            reach2 = max(reach2, min(out[q], radius2))
+            row = q - offset
+            radius2 = radii[row] * radii[row]
+            out[row] = _best_of(points, weights, begin, end, q, radius2)
+            reach2 = max(reach2, min(out[row], radius2))
         held = gather_near(points, boxes, leaves + leaf, reach2, stack, near, who)
         for i in range(held):
             given[i] = weights[who[i]]
         for q in range(begin, end):
-            radius2, best2 = radii[q] * radii[q], out[q]
+            row = q - offset
+            radius2, best2 = radii[row] * radii[row], out[row]
             if held < 0:
                 best2 = _search(points, boxes, weights, q, radius2, best2, stack, bound)
             else:
                 # The leaf's own points come first, and have been looked at.
                 x, y, z = points[q, 0], points[q, 1], points[q, 2]
                 best2 = min(best2, _least(near, given, end - begin, held, x, y, z, radius2))
-            out[q] = np.sqrt(best2)
+            out[row] = np.sqrt(best2)
