@@ -17,11 +17,20 @@ LEAF = 16
 
 
 @kernel
-def _swap(points: Floats, places: Ints, i: int, j: int) -> None:
+def _swap(points: Floats, places: Ints, i: np.uint64, j: np.uint64) -> None:
     """Exchange points i and j, and their places."""
     for axis in range(3):
         points[i, axis], points[j, axis] = points[j, axis], points[i, axis]
     places[i], places[j] = places[j], places[i]
+
+
+@kernel
+def _shuffled(state: np.uint64) -> np.uint64:
+    """Return the random number that follows `state` (xorshift, Marsaglia 2003)."""
+    state ^= state << np.uint64(13)
+    state ^= state >> np.uint64(7)
+    state ^= state << np.uint64(17)
+    return state
 
 
 @kernel
@@ -32,23 +41,26 @@ def _select(points: Floats, places: Ints, first: int, last: int, middle: int, ax
     scanner makes it slow.
     """
     low, high = first, last - 1
+    along = np.uint64(axis)
     state = np.uint64(88172645463325252)
     while low < high:
-        drawn = np.empty(3, np.float64)
-        for t in range(3):
-            state ^= state << np.uint64(13)
-            state ^= state >> np.uint64(7)
-            state ^= state << np.uint64(17)
-            drawn[t] = points[low + np.int64(state % np.uint64(high - low + 1)), axis]
-        pivot = max(min(drawn[0], drawn[1]), min(max(drawn[0], drawn[1]), drawn[2]))
+        lowest, span = np.uint64(low), np.uint64(high - low + 1)
+        state = _shuffled(state)
+        a = points[lowest + state % span, along]
+        state = _shuffled(state)
+        b = points[lowest + state % span, along]
+        state = _shuffled(state)
+        c = points[lowest + state % span, along]
+        pivot = max(min(a, b), min(max(a, b), c))
         i, j = low, high
         while i <= j:
-            while points[i, axis] < pivot:
+            # Unsigned places: signed ones are asked each time whether they count from the end.
+            while points[np.uint64(i), along] < pivot:
                 i += 1
-            while points[j, axis] > pivot:
+            while points[np.uint64(j), along] > pivot:
                 j -= 1
             if i <= j:
-                _swap(points, places, i, j)
+                _swap(points, places, np.uint64(i), np.uint64(j))
                 i += 1
                 j -= 1
         if middle <= j:
@@ -64,7 +76,7 @@ def _fill_box(points: Floats, first: int, last: int, boxes: Floats, node: int) -
     """Fill the box of `node` from points first .. last - 1."""
     low_x = low_y = low_z = np.inf
     high_x = high_y = high_z = -np.inf
-    for i in range(first, last):
+    for i in range(np.uint64(first), np.uint64(last)):
         low_x, high_x = min(low_x, points[i, 0]), max(high_x, points[i, 0])
         low_y, high_y = min(low_y, points[i, 1]), max(high_y, points[i, 1])
         low_z, high_z = min(low_z, points[i, 2]), max(high_z, points[i, 2])
