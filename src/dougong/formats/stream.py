@@ -22,6 +22,9 @@ from dougong.formats.units import units_of
 from dougong.typing import Mask, Points
 
 MOST_DECIMALS = 6
+FARTHEST = 2.0**53 / 10.0**MOST_DECIMALS
+"""No place on a map has a larger number, whatever its unit; up to here, 9.0e9, float64 holds every
+decimal place that a lattice may have. What lies beyond stands for "no data" (-3.4e38, 1e20)."""
 
 
 @contextmanager
@@ -116,6 +119,8 @@ class Survey:
     """Decimal places that hold every coordinate exactly, per axis; None: true floats."""
     rows: int = 0
     not_finite: int = 0
+    too_far: int = 0
+    """Rows with a number beyond `FARTHEST`."""
     invalid: int = 0
     lacking: str = "no finite coordinates"
     """What a row that is not finite had."""
@@ -135,19 +140,22 @@ class Survey:
 
     def count(self, block: Block) -> Mask:
         """Count the rows of a block, good and bad, and return which are good."""
-        is_ok: Mask = _finite_rows(block.coordinates)
+        is_ok: Mask = usable_rows(block.coordinates)
         self.rows += len(is_ok)
-        if block.is_invalid is not None and block.is_invalid.any():
-            self.invalid += int(block.is_invalid.sum())
-            self.not_finite += int((~is_ok & ~block.is_invalid).sum())
-            return is_ok & ~block.is_invalid
-        self.not_finite += len(is_ok) - int(is_ok.sum())
-        return is_ok
+        is_invalid = np.zeros_like(is_ok) if block.is_invalid is None else block.is_invalid
+        if is_ok.all() and not is_invalid.any():
+            return is_ok
+        is_bad = ~is_ok & ~is_invalid
+        too_far = int(np.isfinite(block.coordinates[is_bad]).all(axis=1).sum())
+        self.invalid += int(is_invalid.sum())
+        self.too_far += too_far
+        self.not_finite += int(is_bad.sum()) - too_far
+        return is_ok & ~is_invalid
 
     @property
     def kept(self) -> int:
         """Rows with usable coordinates."""
-        return self.rows - self.not_finite - self.invalid
+        return self.rows - self.not_finite - self.too_far - self.invalid
 
     def notes(self) -> tuple[str, ...]:
         """Return what was dropped, counted, in words."""
@@ -155,6 +163,11 @@ class Survey:
         if self.not_finite:
             found.append(
                 f"{self.not_finite} of {self.rows} rows had {self.lacking} and were dropped."
+            )
+        if self.too_far:
+            found.append(
+                f"{self.too_far} of {self.rows} rows had a coordinate beyond {FARTHEST:.1g}, as "
+                "files write where there are no data, and were dropped."
             )
         if self.invalid:
             found.append(
@@ -164,13 +177,13 @@ class Survey:
         return tuple(found)
 
 
-def _finite_rows(coordinates: Points) -> Mask:
-    """Return which rows (n, 3) are finite; one sum tells where all are."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        if np.isfinite(coordinates.sum()):
-            return np.ones(len(coordinates), dtype=bool)
-    is_finite: Mask = np.asarray(np.isfinite(coordinates).all(axis=1))
-    return is_finite
+def usable_rows(coordinates: Points) -> Mask:
+    """Return which rows (n, 3) hold a place: finite numbers, none beyond `FARTHEST`."""
+    low, high = coordinates.min(initial=0.0), coordinates.max(initial=0.0)
+    if low >= -FARTHEST and high <= FARTHEST:  # NaN fails either comparison
+        return np.ones(len(coordinates), dtype=bool)
+    is_usable: Mask = np.asarray((np.abs(coordinates) <= FARTHEST).all(axis=1))
+    return is_usable
 
 
 def _is_on_lattice(values: NDArray[np.float64], decimals: int) -> bool:
@@ -277,9 +290,11 @@ def _refuse_no_rows(survey: Survey, path: Path) -> None:
     if survey.rows == 0:
         refuse_empty(0, path)
     if survey.kept == 0:
+        far = f"{survey.too_far} beyond {FARTHEST:.1g}, " if survey.too_far else ""
         msg = (
             f"{path.name}: none of its {survey.rows} points has usable coordinates "
-            f"({survey.not_finite} not finite, {survey.invalid} marked invalid). Export it again."
+            f"({survey.not_finite} not finite, {far}{survey.invalid} marked invalid). "
+            "Export it again."
         )
         raise FormatError(msg)
 

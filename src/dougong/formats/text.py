@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dougong.cloud import BitField
 from dougong.errors import FormatError
-from dougong.formats.stream import Block, opened, stem_of
+from dougong.formats.stream import Block, opened, stem_of, usable_rows
 from dougong.formats.text_columns import column_names, named_columns
 from dougong.formats.text_rows import (
     COMMENTS,
@@ -121,7 +121,7 @@ class TextScan:
             axes = [self.names.index(axis) for axis in "xyz"]
             for every in self.tables(rows):
                 # Rows that will be dropped have no say.
-                table = every[np.isfinite(every[:, axes]).all(axis=1)]
+                table = every[usable_rows(every[:, axes])]
                 with np.errstate(invalid="ignore"):
                     low = np.fmin(low, np.fmin.reduce(table, axis=0, initial=np.inf))
                     high = np.fmax(high, np.fmax.reduce(table, axis=0, initial=-np.inf))
