@@ -70,6 +70,20 @@ def test_old_point_formats_keep_their_class():
     assert with_classes(old, [(chosen, 7)]).attribute("classification").tolist() == [7, 2, 3]
 
 
+@pytest.mark.parametrize(
+    ("kind", "label", "stays"),
+    [("u2", 300, True), ("i4", -5, True), ("f8", 1.5, True), ("u1", 9, True), ("?", 1, False)],
+)
+def test_classes_and_their_backup_keep_their_numbers(kind, label, stays):
+    labels = np.array([label, label, 1], kind)
+    cloud = Cloud.from_points(np.zeros((3, 3)), classification=labels)
+    found = with_classes(cloud, [(np.array([True, False, False]), 64)])
+    assert found.attribute("classification").tolist() == [64, label, 1]
+    assert found.attribute("classification_in").tolist() == labels.tolist()
+    assert found.attribute("classification_in").dtype == labels.dtype
+    assert (found.attribute("classification").dtype == labels.dtype) == stays
+
+
 def test_a_run_tells_of_it_on_tiles_too(folder, monkeypatch):
     for name, value in SMALL.items():
         monkeypatch.setattr(memory, name, value)

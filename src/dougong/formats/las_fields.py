@@ -144,6 +144,9 @@ def _place(
         return _place_intensity(records, values, facts, notes)
     if target in _WHOLE:
         if not facts.fits(_WHOLE[target]):
+            notes.append(
+                f"{target} does not fit LAS's 0..{_WHOLE[target]}: kept in an extra dimension."
+            )
             return ""
         whole = values.astype(np.uint64)
         if target == "return_number":

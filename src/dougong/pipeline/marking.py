@@ -1,6 +1,7 @@
 """Removal that can be undone: every point kept, each with its class and its reason."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -86,13 +87,20 @@ def with_classes(cloud: Cloud, classes: list[tuple[NDArray[np.bool_], int]]) -> 
     What an earlier run put there stays: it is the scan's own.
     """
     stored = cloud.attribute("classification")
-    old = np.zeros(len(cloud), np.uint8) if stored is None else stored.astype(np.uint8)
-    new = old.copy()
+    if stored is not None and cloud.attribute("classification_in") is None:
+        cloud = cloud.with_attribute("classification_in", stored)
+    new = np.zeros(len(cloud), np.uint8) if stored is None else stored.copy()
     for chosen, value in classes:
-        if _holds(cloud, value):
-            new[chosen] = value
-    if stored is not None:
-        if cloud.attribute("classification_in") is None:
-            cloud = cloud.with_attribute("classification_in", old)
-        new = new.astype(stored.dtype)
+        if not _holds(cloud, value):
+            continue
+        if new.dtype.type(value) != value:
+            cloud, new = _widened(cloud), new.astype(np.uint8)
+        new[chosen] = value
     return cloud.with_attribute("classification", new)
+
+
+def _widened(cloud: Cloud) -> Cloud:
+    """Return `cloud` with room for any of our classes where flags stood for its own."""
+    fields = [(name, cloud.records.dtype[name]) for name in cloud.records.dtype.names or ()]
+    layout = [(n, np.dtype(np.uint8) if n == "classification" else kind) for n, kind in fields]
+    return replace(cloud, records=cloud.records.astype(layout))
