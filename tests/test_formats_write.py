@@ -205,6 +205,30 @@ def test_attributes_travel_between_families(tmp_path, suffix):
         assert read(tmp_path / "c.ply").attribute("red").dtype == np.uint8
 
 
+def test_long_names_are_cut_by_bytes_and_told_apart_by_numbers(tmp_path):
+    same, ratio = "a" * 30, "平均曲率与粗糙度的比值"
+    columns = {f"{same}_{end}": np.full(4, k) for k, end in enumerate(["one", "one_more", "ones"])}
+    columns |= {ratio + end: np.full(4, k + 0.5) for k, end in enumerate("甲乙丙")}
+    columns[same + "_vector"] = np.arange(12.0).reshape(4, 3)
+    cloud = small(4)
+    layout = [(name, column.dtype, column.shape[1:]) for name, column in columns.items()]
+    records = np.zeros(4, dtype=[*cloud.records.dtype.descr, *layout])
+    for name, column in columns.items():
+        records[name] = column
+    written = write(replace(cloud, records=records), tmp_path / "a.las")
+    found = read(tmp_path / "a.las")
+    names = [f"{same}_o", f"{same}_2", f"{same}_3"]
+    names += [ratio[:10], f"{ratio[:10]}_2", f"{ratio[:10]}_3"]
+    vector = [f"{same}_{k}" if k < 2 else f"{'a' * 28}_2_2" for k in range(3)]
+    assert list(laspy.read(tmp_path / "a.las").point_format.extra_dimension_names) == names + vector
+    for name, column in zip(names, columns.values(), strict=False):
+        assert np.array_equal(found.attribute(name), column)
+    held = np.stack([found.attribute(name) for name in vector], axis=1)
+    assert np.array_equal(held, columns[same + "_vector"])
+    said = f"{same}_one_more is named {same}_2: LAS names hold 32 bytes, each once."
+    assert said in written.notes
+
+
 def test_near_infrared_gives_point_format_8(tmp_path):
     cloud = small(5, nir=np.arange(5, dtype="u2"), red=np.zeros(5, "u2"))
     write(cloud, tmp_path / "a.las")

@@ -40,6 +40,7 @@ MOVED_M = 1e-3
 """A moved point leaves its file's lattice; its new step is this or finer."""
 _DEGREES = 1e-7
 _MOST_STEPS = 2**31 - 1
+_NAME_BYTES = 32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -208,11 +209,13 @@ def _with_columns(
     """Append `columns` to records and header as extra dimensions."""
     held: dict[str, NDArray[np.generic]] = {}
     for name, values in columns.items():
-        for key, column in _as_extra(name, values, notes):
-            unique = key
-            while unique in held or unique in (records.dtype.names or ()):
-                unique = f"{unique[:30]}_"
-            held[unique] = column
+        for end, column in _as_extra(name, values, notes):
+            fitted = _fitted(name, end, {*held, *(records.dtype.names or ())})
+            if fitted != name + end:
+                notes.append(
+                    f"{name}{end} is named {fitted}: LAS names hold {_NAME_BYTES} bytes, each once."
+                )
+            held[fitted] = column
     if not held:
         return header, records
     layout = [(name, records.dtype[name]) for name in records.dtype.names or ()]
@@ -226,22 +229,30 @@ def _with_columns(
     return describe_extras(header, {name: held[name].dtype for name in held}), joined
 
 
+def _fitted(name: str, end: str, taken: set[str]) -> str:
+    """Return `name` and `end` in 32 bytes of whole characters, numbered if that is `taken`."""
+    number = 1
+    while True:
+        tail = end if number == 1 else f"_{number}{end}"
+        start = name.encode()[: _NAME_BYTES - len(tail)].decode("utf-8", "ignore")
+        if start + tail not in taken:
+            return start + tail
+        number += 1
+
+
 def _as_extra(
     name: str, values: NDArray[np.generic], notes: list[str]
 ) -> list[tuple[str, NDArray[np.generic]]]:
-    """Return `values` as columns of types LAS has; note what it has not."""
-    short = name.encode()[:32].decode("utf-8", "ignore")
-    if short != name:
-        notes.append(f"{name} is named {short}: LAS names hold 32 bytes.")
+    """Return `values` as columns of types LAS has, with the ends of their names; note the rest."""
     if values.ndim == 2 and values.shape[1] <= 3:
-        parts = [(f"{short[:30]}_{k}", values[:, k]) for k in range(values.shape[1])]
+        parts = [(f"_{k}", values[:, k]) for k in range(values.shape[1])]
     elif values.ndim == 1:
-        parts = [(short, values)]
+        parts = [("", values)]
     else:
         notes.append(f"{name} holds {values[:1].size} numbers per point, LAS at most 3: left out.")
         return []
     found = []
-    for key, column in parts:
+    for end, column in parts:
         kind = column.dtype
         if kind.kind == "b":
             column = column.astype("u1")
@@ -250,7 +261,7 @@ def _as_extra(
         elif kind.newbyteorder("<").str.lstrip("|") not in EXTRA_TYPES:
             notes.append(f"{name} has type {kind}, which LAS does not have: left out.")
             continue
-        found.append((key, column.astype(column.dtype.newbyteorder("<"), copy=False)))
+        found.append((end, column.astype(column.dtype.newbyteorder("<"), copy=False)))
     return found
 
 
