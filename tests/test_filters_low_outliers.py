@@ -115,6 +115,18 @@ def test_a_single_point_far_below_goes():
     assert not high.any()
 
 
+@pytest.mark.parametrize("far", [9e9, 1e16, 3.4028235e38])
+@pytest.mark.parametrize("strays", [(1,), (-1,), (-1, 1)])
+def test_a_stray_at_no_place_leaves_the_guard_on(far, strays):
+    points = patch(np.random.default_rng(5), 30, (0, 40, 0, 40), 0.0)
+    below = np.array([[20.0, 20.0, -2.0], [12.0, 9.0, -5.0]])
+    odd = [[10.0 + side, 10.0, side * far] for side in strays]
+    low = is_low(np.concatenate([points, below, odd]))
+    expected = [len(points), len(points) + 1]
+    expected += [len(points) + 2] if strays[0] < 0 else []
+    assert np.flatnonzero(low).tolist() == expected
+
+
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 1000))
 def test_order_offset_and_threads_change_nothing(seed):

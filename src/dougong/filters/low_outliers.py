@@ -14,6 +14,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from dougong._checks import as_points
 from dougong.errors import InputError
 from dougong.filters.extent import plan_box_of
+from dougong.filters.ranks import median
 from dougong.filters.selection import Selection
 from dougong.kernels import low_outliers as kernels
 from dougong.kernels import raster
@@ -25,6 +26,8 @@ KIND: Literal["local", "two-pass", "global"] = "two-pass"
 
 _BLOCK = 1 << 18
 _MAX_CELLS = 20_000_000
+_MAX_LEVELS = 1 << 36
+"""A stray may lie anywhere: with this many levels keys fit int64, and heights keep a micrometre."""
 _SMALLEST_CELL_M = 0.25
 _LARGEST_CELL_M = 16.0
 _POINTS_PER_CELL = 4
@@ -181,7 +184,11 @@ def _columns(blocks: Blocks, points: int, params: LowOutliers) -> _Columns:
     level = max(params.min_depth_m / 2, cell / 4)
     rows, columns = _plan_shape(low, high, cell)
     highest = max(float(block[:, 2].max()) for block in blocks() if len(block))
-    levels = int((highest - lowest) / level) + 2
+    if highest - lowest > _MAX_LEVELS * level:
+        # Half of the levels below the middle: what lies lower is in the lowest.
+        middle = median(lambda: (block[:, 2] for block in blocks()))
+        lowest = max(lowest, middle - _MAX_LEVELS / 2 * level)
+    levels = int(min((highest - lowest) / level, _MAX_LEVELS)) + 2
     shape = (rows, columns, levels)
     origin = np.append(low, lowest)
     unique, counts = np.empty(0, np.int64), np.empty(0, np.int64)

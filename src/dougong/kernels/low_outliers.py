@@ -21,17 +21,21 @@ def voxel_keys(
     shape: tuple[int, int, int],
     out: Ints,
 ) -> None:
-    """Fill out[i] with the key of the voxel of point i; -1 outside.
+    """Fill out[i] with the key of the voxel of point i; -1 beside or above all.
 
     points (n, 3); origin (3,): low corner of voxel 0; shape (rows, columns, levels); out (n,).
+    What lies below all levels counts with the lowest.
     """
     rows, columns, levels = shape
     for i in range(points.shape[0]):
-        column = int(np.floor(rounded(points[i, 0], origin[0]) / cell))
-        row = int(np.floor(rounded(points[i, 1], origin[1]) / cell))
-        k = int(np.floor(rounded(points[i, 2], origin[2]) / level))
-        is_inside = 0 <= column < columns and 0 <= row < rows and 0 <= k < levels
-        out[i] = (row * columns + column) * levels + k if is_inside else -1
+        column = np.floor(rounded(points[i, 0], origin[0]) / cell)
+        row = np.floor(rounded(points[i, 1], origin[1]) / cell)
+        k = max(np.floor(rounded(points[i, 2], origin[2]) / level), 0.0)
+        # Compared as they are: a float beyond int64 has no integer.
+        if 0 <= column < columns and 0 <= row < rows and k < levels:
+            out[i] = (int(row) * columns + int(column)) * levels + int(k)
+        else:
+            out[i] = -1
 
 
 @kernel
