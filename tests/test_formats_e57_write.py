@@ -11,6 +11,7 @@ from dougong.errors import FrameError, OutputError
 from dougong.formats import read, read_stations, write, write_merged, write_stations
 from e57_surveys import survey, turn
 from reference.e57 import differing, pose, rotation_of, tree, world
+from test_formats_e57 import cartesian, write_e57
 
 GONE = ("/guid", "/originalGuids", "Bounds/", "/pointGroupingSchemes", "/associatedData3DGuid")
 
@@ -236,6 +237,42 @@ def test_scans_of_a_ptx_file_keep_their_poses(tmp_path):
         own = np.stack([after[f"/data3D/{k}/points/cartesian{a}"] for a in "XYZ"], axis=1)
         assert np.array_equal(own, np.rint(points * 1e4))
         assert (after[f"/data3D/{k}/points/colorGreen"] == 8).all()
+
+
+def mixed_survey(path):
+    """A coloured scan beside one with intensities alone."""
+    rng = np.random.default_rng(3)
+    fields = [cartesian(rng.uniform(-5, 5, (50, 3))) for _ in range(2)]
+    colours = {f"color{name}": rng.integers(1, 256, 50).astype("u1") for name in ("Red", "Green")}
+    fields[0] |= {**colours, "colorBlue": np.zeros(50, "u1")}
+    fields[1] |= {"intensity": rng.random(50).astype("f4")}
+    return write_e57(path, [{"name": "AB"[k], "fields": f} for k, f in enumerate(fields)])
+
+
+def test_a_scan_gets_no_channel_of_another(tmp_path):
+    cloud = read(mixed_survey(tmp_path / "a.e57"))
+    write(cloud, tmp_path / "b.e57")
+    before, after = read_stations(tmp_path / "a.e57"), read_stations(tmp_path / "b.e57")
+    for old, new in zip(before, after, strict=True):
+        assert new.attributes == old.attributes
+        assert new.records.tobytes() == old.records.tobytes()
+    # What was set since is the scan's own, also under a name that another scan brought.
+    write(cloud.with_attribute("intensity", np.full(100, 0.5, "f4")), tmp_path / "c.e57")
+    first = read_stations(tmp_path / "c.e57")[0]
+    assert (first.attribute("intensity") == 0.5).all()
+    assert first.attribute("blue") is not None
+
+
+def test_a_ptx_scan_without_colours_gets_none(tmp_path):
+    head = ["2", "1", "0 0 0", "1 0 0", "0 1 0", "0 0 1"]
+    head += ["1 0 0 0", "0 1 0 0", "0 0 1 0", "0 0 0 1"]
+    lines = [*head, "1 2 3 0.5 9 8 7", "2 3 4 0.25 6 5 4", *head, "1 1 1 0.5", "2 2 2 0.25"]
+    (tmp_path / "a.ptx").write_text("\n".join([*lines, ""]))
+    write(read(tmp_path / "a.ptx"), tmp_path / "b.e57")
+    first, second = read_stations(tmp_path / "b.e57")
+    assert first.attribute("red").tolist() == [9, 6]
+    assert second.attribute("red") is None
+    assert second.attribute("intensity").tolist() == [0.5, 0.25]
 
 
 def test_clouds_as_scans_of_one_file(tmp_path):

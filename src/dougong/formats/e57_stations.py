@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from dougong.cloud import Cloud
@@ -40,6 +41,7 @@ from dougong.typing import Transform
 FINEST_M = 1e-4
 """Step of coordinates whose own step is coarser: 0.1 mm."""
 _MOST_STEPS = 2**52
+_COLOURS = ("red", "green", "blue")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,8 +74,36 @@ def stations_of(cloud: Cloud, notes: list[str]) -> list[Station]:
     for header in headers:
         chosen = np.flatnonzero(station == header.station)
         if len(chosen):
-            found.append(_posed(cloud.select(chosen), header, notes))
+            own = _without_foreign(cloud.select(chosen), header, headers)
+            found.append(_posed(own, header, notes))
     return found
+
+
+def _without_foreign(
+    cloud: Cloud, header: E57Header | PtxHeader, headers: tuple[E57Header | PtxHeader, ...]
+) -> Cloud:
+    """Return one scan's part of a survey without what only other scans have.
+
+    Scans read as one cloud have the fields of all, 0 where a scan has none: channels that its
+    scanner never had. What somebody set since is another number, and stays.
+    """
+    own = _attributes_of(header)
+    foreign = {name for other in headers for name in _attributes_of(other)} - own
+    if isinstance(header, PtxHeader):
+        foreign = set(_COLOURS)  # four columns have none, and the header does not say how many
+    names = [
+        name
+        for name in cloud.records.dtype.names or ()
+        if name not in foreign or cloud.records[name].any()
+    ]
+    if len(names) == len(cloud.records.dtype.names or ()):
+        return cloud
+    return replace(cloud, records=repack_fields(cloud.records[names]))
+
+
+def _attributes_of(header: E57Header | PtxHeader) -> set[str]:
+    fields = header.fields if isinstance(header, E57Header) else ()
+    return {attribute_name(name) for name in fields}
 
 
 def _posed(cloud: Cloud, header: E57Header | PtxHeader, notes: list[str]) -> Station:
