@@ -76,6 +76,28 @@ def test_headers_name_the_columns(tmp_path, header, order):
 
 
 @pytest.mark.parametrize(
+    ("header", "names", "said"),
+    [
+        ("height,x,y,z", ("height", "x", "y", "z"), None),
+        ("Easting,Northing,x,y,z", ("Easting", "Northing", "x", "y", "z"), None),
+        ("i,Intensity,X[m],Y[m],Z[m]", ("i", "intensity", "x", "y", "z"), None),
+        (
+            "East,North,h,alt,R",
+            ("x", "y", "z", "alt", "red"),
+            "columns were taken: East as x, North as y, h as z, R as red.",
+        ),
+        ("x,y,z,x,X_2", ("x", "y", "z", "x_2", "X_2"), None),
+    ],
+)
+def test_a_name_counts_before_its_synonyms_and_synonyms_are_said(tmp_path, header, names, said):
+    row = ",".join(map(str, range(1, len(names) + 1)))
+    cloud = read(save(tmp_path, f"{header}\n{row}\n{row}\n"))
+    assert cloud.records.dtype.names == names
+    assert coordinates(cloud)[0].tolist() == [1.0 + names.index(axis) for axis in "xyz"]
+    assert [note for note in cloud.notes if "taken" in note] == ([said] if said else [])
+
+
+@pytest.mark.parametrize(
     ("rows", "names"),
     [
         (["1 2 3 0.5", "4 5 6 0.7"], ["intensity"]),

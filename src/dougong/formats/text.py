@@ -179,13 +179,12 @@ def open_text(path: Path) -> TextScan:
     layout = _layout(path, sample, is_whole=len(sample) < _SAMPLE_BYTES)
     if layout.names is not None:
         is_trailing = len(layout.names) > 3 and not layout.names[-1]
-        names = named_columns(layout.names[:-1] if is_trailing else layout.names)
-        notes = []
+        names, assumed = named_columns(layout.names[:-1] if is_trailing else layout.names)
     else:
         names, assumed = column_names(
             layout.sample, is_pts=layout.count is not None or path.suffix.lower() == ".pts"
         )
-        notes = [assumed] if assumed else []
+    notes = [assumed] if assumed else []
     if layout.passed_over:
         notes.append(f"columns of words were not read: {', '.join(layout.passed_over)}.")
     if not {"x", "y", "z"} <= set(names):

@@ -29,18 +29,31 @@ _RGB = ("red", "green", "blue")
 _NORMAL = ("nx", "ny", "nz")
 
 
-def named_columns(words: tuple[str, ...]) -> tuple[str, ...]:
-    """Return attribute names from the words of a header line, each once."""
-    names: list[str] = []
-    for word in words:
-        key = _UNIT.sub("", word.strip().lower().removeprefix("scalar_"))
+def named_columns(words: tuple[str, ...]) -> tuple[tuple[str, ...], str | None]:
+    """Return attribute names from the words of a header line, each once, and what was assumed.
+
+    A name that is written out counts before any synonym of it, wherever it stands.
+    """
+    keys = [_UNIT.sub("", word.strip().lower().removeprefix("scalar_")) for word in words]
+    found: dict[str, int] = {}
+    for column, key in enumerate(keys):
+        if key in _SYNONYMS:
+            found.setdefault(key, column)
+    assumed = []
+    for column, key in enumerate(keys):
         name = next((name for name, same in _SYNONYMS.items() if key in same), None)
-        name = name if name is not None and name not in names else word.strip() or "field"
+        if name is not None and name not in found:
+            found[name] = column
+            assumed.append(f"{words[column].strip()} as {name}")
+    known = {column: name for name, column in found.items()}
+    names: list[str] = []
+    for column, word in enumerate(words):
+        name = known.get(column) or word.strip() or "field"
         unique, number = name, 2
-        while unique in names:
+        while unique in names or (unique in found and found[unique] != column):
             unique, number = f"{name}_{number}", number + 1
         names.append(unique)
-    return tuple(names)
+    return tuple(names), f"columns were taken: {', '.join(assumed)}." if assumed else None
 
 
 def _is_whole(columns: NDArray[np.float64], most: float) -> bool:
