@@ -58,6 +58,53 @@ def test_packed_attributes_are_set_without_touching_their_neighbours():
         cloud.with_attribute("low", np.array([8, 0]))
 
 
+@pytest.mark.parametrize(
+    ("kind", "values", "said"),
+    [
+        ("u2", [70000, -1], "cannot hold 2 of 2 values (first: 70000 in row 0)"),
+        ("u2", [1, 0.5], "cannot hold 1 of 2 values (first: 0.5 in row 1)"),
+        ("u2", [1, np.nan], "stored as uint16"),
+        ("u2", ["a", "b"], "stored as uint16"),
+        ("f4", [1.0, 1e300], "stored as float32"),
+        ("f8", [1, 2**53 + 1], "(first: 9007199254740993 in row 1)"),
+        ("i8", np.array([1, 2**63], "u8"), "stored as int64"),
+    ],
+)
+def test_a_value_that_its_attribute_cannot_hold_is_refused(kind, values, said):
+    cloud = Cloud.from_points(np.zeros((2, 3)), intensity=np.array([3, 4], kind))
+    with pytest.raises(InputError) as error:
+        cloud.with_attribute("intensity", values)
+    assert said in str(error.value)
+    fits = cloud.with_attribute("intensity", np.array([1.0, 250.0]))
+    assert fits.attribute("intensity").tolist() == [1, 250]
+    assert fits.records.dtype == cloud.records.dtype
+
+
+def test_what_is_set_has_the_shape_of_its_attribute():
+    records = np.zeros(3, dtype=[("flags", "u1"), ("v", "f4", (2,)), ("q", "f4")])
+    bits = {"low": BitField("flags", 0b111)}
+    cloud = Cloud(xyz=np.zeros((3, 3)), records=records, frame=Frame(), bits=bits)
+    vector = np.arange(6.0).reshape(3, 2)
+    assert np.array_equal(cloud.with_attribute("v", vector).attribute("v"), vector)
+    assert np.isnan(cloud.with_attribute("q", [1, np.nan, 2]).attribute("q")[1])
+    for name, values in (("v", np.zeros(3)), ("q", 1.0), ("low", 1), ("new", vector)):
+        with pytest.raises(InputError, match=f"{name} must have shape"):
+            cloud.with_attribute(name, values)
+    with pytest.raises(InputError, match="low is stored as uint8"):
+        cloud.with_attribute("low", [0.5, 1, 2])
+
+
+def test_a_cloud_is_built_of_one_value_per_point_at_places():
+    points = np.eye(3)
+    for values in (np.zeros(4), 5, np.zeros((3, 2))):
+        with pytest.raises(InputError, match=r"tag must have shape \(3,\)"):
+            Cloud.from_points(points, tag=values)
+    with pytest.raises(InputError, match="x is a coordinate"):
+        Cloud.from_points(points, x=np.zeros(3))
+    with pytest.raises(InputError, match=r"1 of 3 rows .* beyond 9e\+09 \(first: row 1\)"):
+        Cloud.from_points(np.diag([1.0, -3.4e38, 1.0]))
+
+
 def test_moving_map_coordinates_loses_no_digit_to_the_offset():
     """A turn about a point 4000 km from zero must not cost a micrometre."""
     rng = np.random.default_rng(0)

@@ -305,7 +305,7 @@ def test_a_lost_source_is_said(tmp_path):
 
 def test_a_number_beyond_its_field_is_said(tmp_path):
     cloud = read_stations(survey(tmp_path / "a.e57"))[0]
-    cloud = cloud.with_attribute("row_index", np.full(len(cloud), -1))
+    cloud = cloud.with_attribute("row_index", np.full(len(cloud), 2**32 - 1))
     with pytest.raises(OutputError, match=r"rowIndex holds .* and its E57 field takes 0 to"):
         write(cloud, tmp_path / "b.e57")
     assert [p.name for p in tmp_path.iterdir()] == ["a.e57"]

@@ -11,7 +11,7 @@ from dougong import app
 from dougong.cli import call
 from dougong.cloud import BitField, Cloud
 from dougong.pipeline import memory
-from dougong.pipeline.marking import with_classes
+from dougong.pipeline.marking import marked, with_classes
 from dougong.pipeline.progress import Silent
 from test_filters_clutter import on_ground
 from test_pipeline_large import SMALL, bytes_of, comparable
@@ -82,6 +82,14 @@ def test_classes_and_their_backup_keep_their_numbers(kind, label, stays):
     assert found.attribute("classification_in").tolist() == labels.tolist()
     assert found.attribute("classification_in").dtype == labels.dtype
     assert (found.attribute("classification").dtype == labels.dtype) == stays
+
+
+def test_marks_of_an_earlier_run_are_replaced_whatever_type_they_came_back_in():
+    zeros = np.zeros(2, np.uint8)  # as a text file's column of zeros is read
+    cloud = Cloud.from_points(np.zeros((2, 3)), dougong_margin=zeros)
+    margin = np.array([0.25, 3.5], np.float32)
+    again = marked(cloud, zeros, zeros, {"dougong_margin": margin})
+    np.testing.assert_array_equal(again.attribute("dougong_margin"), margin)
 
 
 def test_a_run_tells_of_it_on_tiles_too(folder, monkeypatch):

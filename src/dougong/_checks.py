@@ -1,7 +1,9 @@
 """Turn what a user passes into what the kernels accept, or say what is wrong."""
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dougong.errors import InputError
 from dougong.typing import Points, Transform
@@ -31,6 +33,40 @@ def as_points(value: ArrayLike, name: str = "points") -> Points:
         )
         raise InputError(msg)
     return points
+
+
+def refuse_other_shape(name: str, values: NDArray[Any], shape: tuple[int, ...]) -> None:
+    """Raise InputError unless an attribute has one value, or so many, per point."""
+    if values.shape != shape:
+        each = "one value" if len(shape) == 1 else f"{shape[1]} values"
+        msg = f"{name} must have shape {shape}, got {values.shape}: {each} per point."
+        raise InputError(msg)
+
+
+def as_stored(name: str, values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Return `values` as the type in which an attribute is stored, if it holds every one of them.
+
+    Raises
+    ------
+    InputError
+        It does not: numbers would wrap, be cut or rounded.
+    """
+    try:
+        with np.errstate(invalid="ignore", over="ignore"):
+            fitted = values.astype(kind)
+            is_same = (fitted == values) & (fitted.astype(values.dtype) == values)
+            is_same |= (fitted != fitted) & (values != values)  # both NaN
+    except (TypeError, ValueError):
+        is_same = np.zeros(values.shape, dtype=bool)
+    if not is_same.all():
+        first = np.argwhere(~is_same)[0]
+        msg = (
+            f"{name} is stored as {kind.name}, which cannot hold {(~is_same).sum()} of "
+            f"{is_same.size} values (first: {values[tuple(first)]} in row {first[0]}). Round or "
+            "clip them to that type, or give the attribute another name."
+        )
+        raise InputError(msg)
+    return fitted
 
 
 def as_transform(value: ArrayLike, name: str = "matrix") -> Transform:

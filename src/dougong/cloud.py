@@ -14,9 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dougong._checks import as_points, as_transform
+from dougong._checks import as_points, as_stored, as_transform, refuse_other_shape
 from dougong.errors import InputError
 from dougong.typing import Index, Mask, Points, Transform
+
+FARTHEST = 2.0**53 / 1e6
+"""No place on a map has a larger number, whatever its unit; up to here, 9.0e9, float64 holds six
+decimal places exactly. What lies beyond stands for "no data" (-3.4e38, 1e20)."""
 
 Records = NDArray[np.void]
 """(n,), structured: one record per point, fields named and typed as in the file."""
@@ -129,6 +133,17 @@ def transformed(xyz: Points, linear: NDArray[np.float64], shift: NDArray[np.floa
     return moved
 
 
+def _refuse_no_places(xyz: Points) -> None:
+    is_far = (np.abs(xyz) > FARTHEST).any(axis=1)
+    if is_far.any():
+        msg = (
+            f"points has {is_far.sum()} of {len(xyz)} rows with a coordinate beyond {FARTHEST:.1g} "
+            f"(first: row {np.flatnonzero(is_far)[0]}), which is no place. "
+            f"Drop them: points[(abs(points) <= {FARTHEST:.1g}).all(1)]."
+        )
+        raise InputError(msg)
+
+
 def _step_in(source: Frame, target: Frame, scale: float) -> tuple[float, float, float] | None:
     """Return the source's finest step in target units: a turn mixes the axes."""
     if source.step is None:
@@ -187,10 +202,24 @@ class Cloud:
             Metres, as large as map coordinates are; the local origin is their rounded low corner.
         **attributes : array_like, shape (n,)
             Further fields of the records (``intensity=``, ``red=`` ...), kept with their dtype.
+
+        Raises
+        ------
+        InputError
+            A coordinate is not finite or beyond `FARTHEST`, an attribute has another length or
+            the name of a coordinate.
         """
         xyz = as_points(points)
-        origin = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)
         columns = {name_: np.asarray(values) for name_, values in attributes.items()}
+        for name_, values in columns.items():
+            if name_ in ("x", "y", "z"):
+                msg = (
+                    f"{name_} is a coordinate and comes from points. Name the attribute otherwise."
+                )
+                raise InputError(msg)
+            refuse_other_shape(name_, values, (len(xyz),))
+        _refuse_no_places(xyz)
+        origin = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)
         dtype = [(axis, "<f8") for axis in "xyz"]
         dtype += [(name_, values.dtype.str) for name_, values in columns.items()]
         records = np.empty(len(xyz), dtype=dtype)
@@ -234,11 +263,18 @@ class Cloud:
         )
 
     def with_attribute(self, name: str, values: ArrayLike) -> Cloud:
-        """Return the cloud with attribute `name` (n,) set, added to the records when new."""
+        """Return the cloud with attribute `name` (n,) set, added to the records when new.
+
+        Raises
+        ------
+        InputError
+            Another shape, or a value that an attribute which is there already cannot hold in its
+            type.
+        """
         column = np.asarray(values)
-        if column.shape != (len(self),):
-            msg = f"{name} must have shape ({len(self)},), got {column.shape}: one value per point."
-            raise InputError(msg)
+        is_field = name in (self.records.dtype.names or ()) and name not in self.bits
+        width = self.records.dtype[name].shape if is_field else ()
+        refuse_other_shape(name, column, (len(self), *width))
         if name in self.bits:
             bit = self.bits[name]
             if len(column) and (column.min() < 0 or column.max() > bit.mask >> bit.shift):
@@ -249,13 +285,12 @@ class Cloud:
                 raise InputError(msg)
             records = self.records.copy()
             stored = records[bit.field]
-            stored[:] = (stored & ~stored.dtype.type(bit.mask)) | (
-                column.astype(stored.dtype) << bit.shift
-            )
+            fitted = as_stored(name, column, stored.dtype)
+            stored[:] = (stored & ~stored.dtype.type(bit.mask)) | (fitted << bit.shift)
             return replace(self, records=records)
-        if name in (self.records.dtype.names or ()):
+        if is_field:
             records = self.records.copy()
-            records[name] = column
+            records[name] = as_stored(name, column, self.records.dtype[name].base)
             return replace(self, records=records)
         dtype = [(old, self.records.dtype[old]) for old in self.records.dtype.names or ()]
         records = np.empty(len(self), dtype=[*dtype, (name, column.dtype)])

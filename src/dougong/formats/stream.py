@@ -16,15 +16,12 @@ from typing import IO, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.cloud import BitField, Cloud, Frame, Records, chosen_rows
+from dougong.cloud import FARTHEST, BitField, Cloud, Frame, Records, chosen_rows
 from dougong.errors import FormatError
 from dougong.formats.units import units_of
 from dougong.typing import Mask, Points
 
 MOST_DECIMALS = 6
-FARTHEST = 2.0**53 / 10.0**MOST_DECIMALS
-"""No place on a map has a larger number, whatever its unit; up to here, 9.0e9, float64 holds every
-decimal place that a lattice may have. What lies beyond stands for "no data" (-3.4e38, 1e20)."""
 
 
 @contextmanager

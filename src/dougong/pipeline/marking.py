@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from dougong.cloud import Cloud
 from dougong.filters.clutter import Clutter
@@ -49,9 +49,9 @@ def marked(
         cloud,
         [(is_ground, GROUND_CLASS), (is_noise, NOISE_CLASS), (is_clutter, CLUTTER_CLASS)],
     )
-    result = result.with_attribute("dougong_reason", codes.astype(np.uint8))
+    result = _with_ours(result, "dougong_reason", codes.astype(np.uint8))
     for name, values in (details or {}).items():
-        result = result.with_attribute(name, values)
+        result = _with_ours(result, name, values)
     return result
 
 
@@ -65,8 +65,8 @@ def with_clutter(filtered: Filtered) -> Cloud:
     is_kept = filtered.codes == Reason.KEPT
     kind = filtered.details[CLUTTER][is_kept]
     result = with_classes(filtered.cloud, [(kind > 0, CLUTTER_CLASS)])
-    result = result.with_attribute(CLUTTER, kind)
-    return result.with_attribute(CLUTTER_MARGIN, filtered.details[CLUTTER_MARGIN][is_kept])
+    result = _with_ours(result, CLUTTER, kind)
+    return _with_ours(result, CLUTTER_MARGIN, filtered.details[CLUTTER_MARGIN][is_kept])
 
 
 def clutter_of(details: Mapping[str, NDArray[Any]], points: int) -> Mask:
@@ -94,13 +94,21 @@ def with_classes(cloud: Cloud, classes: list[tuple[NDArray[np.bool_], int]]) -> 
         if not _holds(cloud, value):
             continue
         if new.dtype.type(value) != value:
-            cloud, new = _widened(cloud), new.astype(np.uint8)
+            cloud, new = _recast(cloud, "classification", np.uint8), new.astype(np.uint8)
         new[chosen] = value
     return cloud.with_attribute("classification", new)
 
 
-def _widened(cloud: Cloud) -> Cloud:
-    """Return `cloud` with room for any of our classes where flags stood for its own."""
-    fields = [(name, cloud.records.dtype[name]) for name in cloud.records.dtype.names or ()]
-    layout = [(n, np.dtype(np.uint8) if n == "classification" else kind) for n, kind in fields]
+def _with_ours(cloud: Cloud, name: str, values: NDArray[Any]) -> Cloud:
+    """Return `cloud` with an attribute of our own, whatever type an earlier run's came back in."""
+    stored = cloud.attribute(name)
+    if stored is not None and not np.can_cast(values.dtype, stored.dtype):
+        cloud = _recast(cloud, name, values.dtype)
+    return cloud.with_attribute(name, values)
+
+
+def _recast(cloud: Cloud, name: str, kind: DTypeLike) -> Cloud:
+    """Return `cloud` with room for values of another type in one field."""
+    fields = [(field, cloud.records.dtype[field]) for field in cloud.records.dtype.names or ()]
+    layout = [(field, np.dtype(kind) if field == name else old) for field, old in fields]
     return replace(cloud, records=cloud.records.astype(layout))
