@@ -346,6 +346,31 @@ def test_merged_clouds_keep_every_attribute_and_know_whose_point_is_whose(tmp_pa
     assert any("its own source_id is replaced" in note for note in again.notes)
 
 
+def with_extras(path, **columns):
+    """Read a LAS file of four points with these extra dimensions, laspy's name of type first."""
+    las = laspy.create(point_format=6, file_version="1.4")
+    las.x = las.y = las.z = np.arange(4.0)
+    for name, (kind, values) in columns.items():
+        las.add_extra_dim(laspy.ExtraBytesParams(name, kind))
+        las[name] = np.broadcast_to(values, las[name].shape)
+    las.write(path)
+    return read(path)
+
+
+def test_merging_leaves_out_what_does_not_go_together_and_no_other_name(tmp_path):
+    clouds = [
+        with_extras(tmp_path / "a.las", XY=("u2", [1, 2, 3, 4]), w=("u1", 1)),
+        with_extras(tmp_path / "b.las", XY=("u2", 5), w=("3f4", 0.5)),
+        with_extras(tmp_path / "c.las", YZ=("f8", 6.5), w=("u1", 2)),
+    ]
+    written = write_merged(clouds, tmp_path / "m.las", source_ids=range(3))
+    merged = read(tmp_path / "m.las")
+    assert merged.attribute("XY").tolist() == [1, 2, 3, 4, *[5] * 4, *[0] * 4]
+    assert merged.attribute("YZ").tolist() == [0] * 8 + [6.5] * 4
+    assert merged.attribute("w") is None
+    assert written.notes == ("w has types that do not go together: left out.",)
+
+
 def timed(folder, name, times, flag):
     """A LAS cloud with GPS times (n,) under a flag of the header: 1 standard, 0 of a week."""
     las = laspy.create(point_format=6, file_version="1.4")

@@ -191,9 +191,10 @@ def _union(layouts: Sequence[np.dtype[np.void]], notes: list[str]) -> dict[str, 
     """Return every extra dimension, in the wider type where two clouds differ."""
     standard = {name for name, _ in POINT_FORMATS[8]} | {"source_id"}
     found: dict[str, np.dtype[Any]] = {}
+    mixed: set[str] = set()
     for layout in layouts:
         for name in layout.names or ():
-            if name in standard:
+            if name in standard or name in mixed:
                 continue
             kind = layout[name]
             if name in found and found[name] != kind:
@@ -201,6 +202,8 @@ def _union(layouts: Sequence[np.dtype[np.void]], notes: list[str]) -> dict[str, 
                     kind = np.promote_types(found[name], kind)
                 except TypeError:
                     notes.append(f"{name} has types that do not go together: left out.")
+                    mixed.add(name)
+                    del found[name]
                     continue
             if kind.kind == "V" and kind.subdtype is None:
                 notes.append(f"{name} (bytes without a description) is left out.")
@@ -228,7 +231,7 @@ def _descriptions(
 def _fill(out: Records, own: LasHeader, records: Records, header: LasHeader) -> None:
     """Copy one cloud's records into its part of the merged ones, on their lattice."""
     for name in records.dtype.names or ():
-        if name in (out.dtype.names or ()) and name not in "XYZ":
+        if name in (out.dtype.names or ()) and name not in ("X", "Y", "Z"):
             out[name] = records[name]
     is_same = np.array_equal(own.scale, header.scale) and np.array_equal(own.offset, header.offset)
     if is_same:
