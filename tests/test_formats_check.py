@@ -123,6 +123,18 @@ def test_phantom_points_at_zero_are_found(tmp_path):
     assert any("20 points are exactly at 0, 0, 0" in text for text in found)
 
 
+@pytest.mark.parametrize("step", [0.001, 0.25])
+def test_phantom_points_are_found_whatever_the_offsets_of_a_file(tmp_path, step):
+    points = hall() - [499_900, 3_999_900, 0]
+    points[5:25] = 0
+    las = laspy.create(point_format=6, file_version="1.4")
+    las.header.scales, las.header.offsets = [step] * 3, [100.1, 100.3, 7.7]
+    las.x, las.y, las.z = points.T
+    las.write(tmp_path / "a.las")
+    found = texts(tmp_path / "a.las", "warning")
+    assert any("20 points are exactly at 0, 0, 0" in text for text in found)
+
+
 def test_a_heap_of_phantoms_at_zero_does_not_shape_the_site(tmp_path):
     points = hall() + [0, 0, 2300]
     points[::20] = 0

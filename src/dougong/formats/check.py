@@ -62,7 +62,10 @@ class _Tally:
         self.samples.append(cloud.xyz[::stride])
         self.low = np.minimum(self.low, cloud.xyz.min(axis=0))
         self.high = np.maximum(self.high, cloud.xyz.max(axis=0))
-        self.at_origin += int(np.all(cloud.xyz == -cloud.frame.origin, axis=1).sum())
+        # On a lattice that 0, 0, 0 is not on it was rounded to the nearest place.
+        step = np.multiply(cloud.frame.step or (0.0, 0.0, 0.0), cloud.frame.unit_m)
+        near = np.abs(cloud.xyz + cloud.frame.origin) <= 0.500001 * step
+        self.at_origin += int(near.all(axis=1).sum())
         names = cloud.records.dtype.names or ()
         if {"X", "Y", "Z"} <= set(names) and cloud.records.dtype["X"].kind == "i":
             for axis, name in enumerate("XYZ"):
