@@ -1,6 +1,7 @@
 """PLY and PCD: every encoding, against plyfile and by hand-made bytes."""
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import plyfile
@@ -53,6 +54,21 @@ def test_every_encoding_is_read(tmp_path, text, order, faces):
         cloud.frame.to_file(cloud.xyz)[:, 0], cloud.attribute("x"), rtol=0, atol=1e-9
     )
     assert any("20 face" in note for note in cloud.notes) == bool(faces)
+
+
+def test_names_that_blanks_told_apart_stay_apart(tmp_path):
+    columns = {"a b": 1, "a_b": 2, "a  b": 3, " ": 4, "v": [5, 6], "v_0": 7}
+    layout = [(name, "u1", (2,) if name == "v" else ()) for name in columns]
+    cloud = Cloud.from_points(np.eye(3))
+    records = np.zeros(3, dtype=[*cloud.records.dtype.descr, *layout])
+    for name, value in columns.items():
+        records[name] = value
+    written = write(replace(cloud, records=records), tmp_path / "a.ply")
+    found = read(tmp_path / "a.ply")
+    names = ["a_b_2", "a_b", "a_b_3", "field", "v_0", "v_1", "v_0_2"]
+    assert found.attributes[3:] == tuple(names)
+    assert [found.attribute(name)[0] for name in names] == [1, 2, 3, 4, 5, 6, 7]
+    assert any(note.startswith("'a b' is named a_b_2") for note in written.notes)
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

@@ -1,5 +1,7 @@
 """Write a cloud as binary PLY: the vertices of a PLY file bit for bit, others converted."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from dougong.cloud import Cloud, Records
@@ -81,8 +83,7 @@ def _converted(cloud: Cloud, notes: list[str]) -> Records:
 
 def _storable(records: Records, order: str, notes: list[str]) -> Records:
     """Return records of types and names PLY has, in one byte order; as they are when they are."""
-    layout: list[tuple[str, str]] = []
-    columns = []
+    keys, types, columns = [], [], []
     for name in records.dtype.names or ():
         values = records[name]
         parts = {name: values}
@@ -103,9 +104,10 @@ def _storable(records: Records, order: str, notes: list[str]) -> Records:
             else:
                 notes.append(f"{key} has type {kind}, which PLY does not have: left out.")
                 continue
-            safe = "_".join(key.split()) or "field"
-            layout.append((safe, target if target in ("i1", "u1") else order + target))
+            keys.append(key)
+            types.append(target if target in ("i1", "u1") else order + target)
             columns.append(column)
+    layout = list(zip(_safe_names(keys, notes), types, strict=True))
     dtype = np.dtype(layout)
     if dtype == records.dtype:
         return records
@@ -113,6 +115,23 @@ def _storable(records: Records, order: str, notes: list[str]) -> Records:
     for (name, _), column in zip(layout, columns, strict=True):
         stored[name] = column
     return stored
+
+
+def _safe_names(keys: Sequence[str], notes: list[str]) -> list[str]:
+    """Return names without blanks, each there once; those that are so already stay."""
+    taken = {key for key in keys if key.split() == [key]}
+    names: list[str] = []
+    for key in keys:
+        safe = "_".join(key.split()) or "field"
+        name, number = safe, 2
+        while name in names or (name in taken and name != key):
+            name, number = f"{safe}_{number}", number + 1
+        if name != key:
+            notes.append(
+                f"{key!r} is named {name}: PLY names have no blanks, and each is there once."
+            )
+        names.append(name)
+    return names
 
 
 def write_ply(sink: Sink, head: bytes, records: Records) -> int:
