@@ -11,17 +11,35 @@ from dougong import filters
 from dougong.errors import InputError
 
 NAMES = list(filters.FILTERS)
+INF = float("inf")
+# Metres at the defaults: one voxel, the ground window, nothing, unknown until the cloud is known.
+HALOS = {
+    "octree_voxel_grid": 0.005,
+    "low_outliers": 20.0,
+    "cloth_simulation": 0.0,
+    "curvature_weighted": INF,
+    "statistical": INF,
+    "radius": 0.1,
+    "clutter": 15.8,
+    "pass_through": 0.0,
+}
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_row_is_what_its_module_declares(name):
     spec = filters.FILTERS[name]
     module = import_module(f"dougong.filters.{name}")
-    assert spec.kind == sys.modules[f"dougong.filters.{name}"].KIND
-    assert spec.params is getattr(filters, spec.model)
-    assert spec.verb is getattr(filters, name)
-    assert spec.halo_m(spec.params()) >= 0
-    assert module is not None
+    assert spec.kind == module.KIND
+    assert spec.params is getattr(filters, spec.model) is getattr(module, spec.model)
+    assert spec.verb is getattr(filters, name) is getattr(module, name)
+    assert spec.halo_m(spec.params()) == pytest.approx(HALOS[name])
+
+
+def test_halos_follow_from_the_parameters():
+    halo = {name: spec.halo_m for name, spec in filters.FILTERS.items()}
+    assert halo["curvature_weighted"](filters.CurvatureWeighted(reach_m=0.1)) == pytest.approx(1.7)
+    assert halo["statistical"](filters.Statistical(radius_m=0.15)) == 0.15
+    assert halo["octree_voxel_grid"](filters.OctreeVoxelGrid(depth=9)) == INF
 
 
 @pytest.mark.parametrize("name", NAMES)
