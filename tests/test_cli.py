@@ -524,24 +524,31 @@ def test_global_options_may_stand_before_the_command(given, expected):
 
 
 @pytest.mark.parametrize("flags", [[], ["--json"]])
-def test_ctrl_c_while_the_program_loads_is_heard(flags):
+@pytest.mark.parametrize(
+    ("what", "exit_code"),
+    [
+        ("raise KeyboardInterrupt", 130),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGTERM)", 143),
+    ],
+)
+def test_being_ended_while_the_program_loads_is_heard(flags, what, exit_code):
     """It used to end in a traceback."""
     code = (
         "import sys\n"
         "class Interrupted:\n"
         "    def find_spec(self, name, *_):\n"
         "        if name == 'cyclopts':\n"
-        "            raise KeyboardInterrupt\n"
+        f"            {what}\n"
         "sys.meta_path.insert(0, Interrupted())\n"
         f"sys.argv = ['dougong', 'info', 'a.laz', *{flags}]\n"
         "from dougong.cli import main\n"
         "main()\n"
     )
     result = python("-c", code)
-    assert result.returncode == 130
+    assert result.returncode == exit_code
     assert "Traceback" not in result.stderr
     if flags:
-        assert json.loads(result.stdout)["error"]["exit_code"] == 130
+        assert json.loads(result.stdout)["error"]["exit_code"] == exit_code
     else:
         assert result.stderr == "cancelled.\n"
 

@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from dougong.errors import InputError, OutputError
+from dougong.formats.atomic import replacing
 from dougong.pipeline import outputs
 
 
@@ -117,6 +118,51 @@ def test_a_job_of_another_machine_is_not_taken_for_dead(tmp_path):
     ):
         pass
     assert theirs.is_dir()
+
+
+@pytest.fixture
+def dead():
+    """The number of a process of this machine that has ended."""
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        pass
+    return process.pid
+
+
+def write_as_cloud(path):
+    with replacing(path, expected_bytes=1) as sink:
+        sink.write(b"x")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are not asked for elsewhere")
+@pytest.mark.parametrize(
+    "write", [write_as_cloud, lambda path: outputs.write_json(path, {})], ids=["cloud", "books"]
+)
+def test_the_next_writer_of_a_file_clears_what_a_killed_one_left(tmp_path, dead, write):
+    """Parts of 8 GB each stayed beside the output for good."""
+    here = platform.node()
+    for name in (f"o.laz.part-{here}-{dead}", f"o.laz.part-{here}-{os.getppid()}",
+                 f"o.laz.part-elsewhere-{dead}", f"o.laz.part-{dead}", "o.laz.part-of-mine",
+                 f"a.laz.part-{here}-{dead}"):  # fmt: skip
+        (tmp_path / name).write_text("half")
+    write(tmp_path / "o.laz")
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "o.laz", f"o.laz.part-{here}-{os.getppid()}", f"o.laz.part-elsewhere-{dead}",
+        f"o.laz.part-{dead}", "o.laz.part-of-mine", f"a.laz.part-{here}-{dead}",
+    }  # fmt: skip
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are not asked for elsewhere")
+def test_a_folder_of_use_meanwhile_goes_and_that_of_a_killed_job_too(tmp_path, dead):
+    head = tmp_path / "tiles-o-"
+    for mark in (f"{platform.node()}-{dead}", f"{platform.node()}-{os.getpid()}", "elsewhere-1"):
+        (tmp_path / f"tiles-o-{mark}" / "deep").mkdir(parents=True)
+    with outputs.passing_folder(head) as folder:
+        assert not folder.exists(), "our number, of an earlier life"
+        (folder / "deep").mkdir(parents=True)
+        outputs.remove_unfinished()
+        assert not folder.exists(), "cancelled"
+        folder.mkdir()
+    assert [path.name for path in tmp_path.iterdir()] == ["tiles-o-elsewhere-1"]
 
 
 def test_a_result_folder_that_is_a_file_is_refused_at_once(tmp_path):

@@ -1,6 +1,8 @@
 """Tiled work gives the points that whole work gives, whatever the tiles."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 
@@ -223,6 +225,32 @@ def test_a_dask_cluster_gives_the_same(scan, tmp_path, little_room):
         set_engine("local")
         set_threads(2)
     np.testing.assert_array_equal(tiled.records, whole.records)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are sent in another way")
+def test_a_job_told_to_end_leaves_nothing_and_a_killed_one_until_the_next(
+    scan, tmp_path, little_room
+):
+    """Tiles of hundreds of GB stayed beside the output for good."""
+    tokens = ["filter", str(scan), str(tmp_path / "out.laz"), "--kind", "lidar", "--set", VOXEL]
+    tokens += ["--memory", "190kB"]
+
+    def ended_by(number):
+        return subprocess.run(
+            [sys.executable, "-c", KILLED, "7", *tokens],
+            env={**os.environ, "SIGNAL": str(number)}, stderr=subprocess.PIPE, text=True,
+            check=False,
+        )  # fmt: skip
+
+    told = ended_by(signal.SIGTERM)
+    assert told.returncode == 143
+    assert told.stderr.splitlines()[-1] == "cancelled. Nothing was written."
+    assert "Traceback" not in told.stderr
+    assert list(tmp_path.iterdir()) == [scan]
+    assert ended_by(signal.SIGKILL).returncode == -9
+    assert len(list(tmp_path.glob("tiles-out.laz-*"))) == 1
+    assert call([*tokens, "--quiet"]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {scan.name, "out.laz", "out.laz.json"}
 
 
 def test_a_killed_run_goes_on_where_it_was(scan, tmp_path, little_room):

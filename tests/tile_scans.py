@@ -55,7 +55,7 @@ def filtered_by(path, out, *options):
 
 KILLED = """
 import os, sys
-from dougong.cli import call
+from dougong.cli import main
 from dougong.pipeline import memory
 from dougong.tiles import engine
 
@@ -67,9 +67,11 @@ def counted(task):
     global left
     left -= 1
     if left < 0:
-        os.kill(os.getpid(), 9)
+        os.kill(os.getpid(), int(os.environ.get("SIGNAL", "9")))
     return perform(task)
 
 engine.perform = counted
-sys.exit(call(sys.argv[2:]))
+sys.argv[:2] = []
+sys.argv.insert(0, "dougong")
+main()
 """

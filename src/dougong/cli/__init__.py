@@ -1,17 +1,17 @@
 """The ``dougong`` command. A command parses, calls one function of `app`, prints.
 
-Nothing is imported here before `main` listens for Ctrl-C.
+Nothing heavy is imported here before `main` listens for Ctrl-C and SIGTERM.
 """
 
 import os
 import sys
 from collections.abc import Sequence
 
-_CANCELLED = 130
+from dougong.cli._signals import CANCELLED, TERMINATED, code_of, listen
 
 
 def call(tokens: Sequence[str]) -> int:
-    """Run one command line and return its exit code (0, 1, 2, 3 or 130)."""
+    """Run one command line and return its exit code (0, 1, 2, 3, 130 or 143)."""
     from dougong.cli import _commands
 
     return _commands.call(tokens)
@@ -20,12 +20,13 @@ def call(tokens: Sequence[str]) -> int:
 def main() -> None:
     """Run the command line of this process and exit."""
     try:
+        listen()
         code = call(sys.argv[1:])
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         # Before a command began, or after it ended: there is nothing to clean up.
-        _say_cancelled(as_json="--json" in sys.argv)
-        code = _CANCELLED
-    if code == _CANCELLED:
+        code = code_of(error)
+        _say_cancelled(code, as_json="--json" in sys.argv)
+    if code in (CANCELLED, TERMINATED):
         # A kernel may still be running on a thread; a normal exit would wait for it.
         sys.stdout.flush()
         sys.stderr.flush()
@@ -33,9 +34,9 @@ def main() -> None:
     sys.exit(code)
 
 
-def _say_cancelled(*, as_json: bool) -> None:
+def _say_cancelled(code: int, *, as_json: bool) -> None:
     if as_json:
         said = '"type": "Cancelled", "message": "cancelled.", "exit_code": '
-        sys.stdout.write(f'{{"error": {{{said}{_CANCELLED}}}}}\n')
+        sys.stdout.write(f'{{"error": {{{said}{code}}}}}\n')
     else:
         sys.stderr.write("cancelled.\n")

@@ -88,7 +88,7 @@ def command_first(tokens: Sequence[str]) -> list[str]:
 
 
 def call(tokens: Sequence[str]) -> int:
-    """Run one command line and return its exit code (0, 1, 2, 3 or 130)."""
+    """Run one command line and return its exit code (0, 1, 2, 3, 130 or 143)."""
     try:
         code = app(
             command_first(tokens),

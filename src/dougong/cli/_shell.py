@@ -15,9 +15,10 @@ from typing import Any
 from dougong import app, errors
 from dougong.cli._common import Common
 from dougong.cli._progress import Bars, Lines, Quiet, listener
+from dougong.cli._signals import code_of
 from dougong.threads import set_threads
 
-DONE, FAILED, USAGE, UNSURE, CANCELLED = 0, 1, 2, 3, 130
+DONE, FAILED, USAGE, UNSURE = 0, 1, 2, 3
 _UNWIND_SECONDS = 0.6
 
 Listener = Quiet | Lines | Bars
@@ -58,9 +59,9 @@ def execute(common: Common, work: Callable[[Listener], Answer], kept: str = "") 
         app.use_engine(common.engine)
         progress = listener(common.quiet)
         answer = _cancellable(work, progress)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as cancelled:
         progress.close()
-        return _cancelled(common, kept)
+        return _cancelled(common, kept, code_of(cancelled))
     except Exception as error:  # noqa: BLE001 - the last place: every failure gets its sentence
         progress.close()
         return fail(error, as_json=common.json, debug=common.debug)
@@ -103,7 +104,7 @@ def _described(error: BaseException) -> tuple[str, str, int]:
 
 
 def _cancellable(work: Callable[[Listener], Answer], progress: Listener) -> Answer:
-    """Run `work` on a thread of its own, so that Ctrl-C is heard while a kernel runs.
+    """Run `work` on a thread of its own, so that Ctrl-C and SIGTERM are heard while a kernel runs.
 
     Python delivers a signal to the main thread between two of its instructions; a main thread
     inside a long kernel would hear it only at the kernel's end.
@@ -145,14 +146,14 @@ def _stop(thread: threading.Thread) -> None:
     remove_unfinished()
 
 
-def _cancelled(common: Common, kept: str) -> int:
+def _cancelled(common: Common, kept: str, code: int) -> int:
     message = f"cancelled. {kept or 'Nothing was written.'}"
     if common.json:
-        error = {"type": "Cancelled", "message": message, "exit_code": CANCELLED}
+        error = {"type": "Cancelled", "message": message, "exit_code": code}
         _print(json.dumps({"error": error}, indent=2))
     else:
         _say(message + "\n")
-    return CANCELLED
+    return code
 
 
 def _print(text: str) -> bool:

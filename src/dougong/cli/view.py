@@ -1,6 +1,5 @@
 """``dougong view``: clouds of any size in the browser."""
 
-import signal
 import sys
 import threading
 from pathlib import Path
@@ -72,8 +71,6 @@ def command(
     code = execute(common, work)
     try:
         if code == DONE:
-            # Told to end in any way, it leaves no temporary files behind.
-            signal.signal(signal.SIGTERM, signal.default_int_handler)
             sys.stdout.flush()
             threading.Event().wait()
     except KeyboardInterrupt:

@@ -4,7 +4,7 @@ Formats by suffix: in .las .laz .copc.laz .e57 .ply .pcd .xyz .pts .csv .txt .as
 .copc.laz .e57 .ply. The libraries behind them are loaded when a file is opened.
 """
 
-from dougong.formats.atomic import copy_file, part_of
+from dougong.formats.atomic import copy_file
 from dougong.formats.check import check
 from dougong.formats.describe import describe
 from dougong.formats.faults import faults_of
@@ -21,6 +21,7 @@ from dougong.formats.registry import (
     write_stations,
 )
 from dougong.formats.reissue import can_reissue, reissue, scans_in, system_in
+from dougong.formats.unfinished import part_of
 from dougong.formats.units import in_system, is_same_crs, metric_problem, require_metric, units_of
 
 __all__ = [

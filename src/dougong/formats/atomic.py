@@ -1,7 +1,8 @@
 """Write a file beside its place and rename it there: a reader sees all of it or nothing.
 
-The part file is `<name>.part-<process>`, so that two processes never write into one. Whatever goes
-wrong, it is removed; a full disk, a file size limit or a lost permission becomes one `OutputError`.
+The part file is `<name>.part-<machine>-<process>`, so that two processes never write into one.
+Whatever goes wrong, it is removed, that of a killed process by the next one that writes the same
+file; a full disk, a file size limit or a lost permission becomes one `OutputError`.
 """
 
 import contextlib
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from dougong.errors import OutputError
+from dougong.formats.unfinished import clear_parts, part_of
 
 _COPY_BYTES = 8 << 20
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -100,11 +102,6 @@ def refuse_bad_target(path: Path, *, overwrite: bool, source: Path | None = None
         raise OutputError(f"{path} exists already. Pass --overwrite to replace it.")
 
 
-def part_of(path: Path) -> Path:
-    """Return where `path` is written before it is renamed: a name of this process alone."""
-    return path.with_name(f"{path.name}.part-{os.getpid()}")
-
-
 @contextmanager
 def replacing(path: Path, *, expected_bytes: int) -> Iterator[Sink]:
     """Yield a file to fill; it takes the place of `path` only when all went well.
@@ -121,6 +118,7 @@ def replacing(path: Path, *, expected_bytes: int) -> Iterator[Sink]:
         The disk is full, or the folder cannot be written to.
     """
     part = part_of(path)
+    clear_parts(path)
     try:
         file = part.open("w+b")
     except OSError as error:

@@ -1,7 +1,6 @@
 """``dougong filter``: one file through a recipe or one filter, with its books beside it."""
 
 import hashlib
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from dougong.params import Parameters
 from dougong.pipeline.books import Books, Tally
 from dougong.pipeline.marking import GROUND_CLASS, marked, marks_clutter, with_classes, with_clutter
 from dougong.pipeline.memory import Room
-from dougong.pipeline.outputs import refuse_output, watched, write_json
+from dougong.pipeline.outputs import passing_folder, refuse_output, watched, write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import (
     Clock,
@@ -161,7 +160,7 @@ def filter_file(
             progress.note(f"{input.name} is larger than memory: it is filtered on tiles")
             with clock.measure("filter"):
                 books, again = _filtered_on_tiles(input, stamp, job, room, places, progress)
-            hold = Hold(room.held_points(), output.parent)
+            hold = Hold(room.held_points(), places.writing)
             result = _pieces(again, job, books, mark)
         else:
             with clock.measure("read"):
@@ -191,27 +190,35 @@ def filter_file(
     return cleaned
 
 
-@contextmanager
-def _places(output: Path, work: Folder | None, facts: str) -> Iterator[tuple[Folder, Path]]:
-    """Yield a folder for tiles, and one on a disk for what is of use while they are cut.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Places:
+    """Where a cloud that is larger than memory lies meanwhile."""
 
-    The tiles' is in `work`, named by what they depend on; what is beside the output goes again.
+    tiles: Folder
+    scratch: Path
+    """On a disk: gets what is of use while tiles are cut."""
+    writing: Path
+    """On a disk: gets what is of use while the output is written."""
+
+
+@contextmanager
+def _places(output: Path, work: Folder | None, facts: str) -> Iterator[_Places]:
+    """Yield where tiles go: in `work`, named by what they depend on, else beside the output.
+
+    What is beside the output goes again.
     """
     told = f"{dougong.__version__} {facts}"
     key = hashlib.sha256(told.encode()).hexdigest()[:16]
-    name = f"tiles-{key}"
-    # Where a killed run left something, the one that goes on with its tiles finds it and tidies up.
-    beside = LocalFolder(
-        output.with_name(f"tiles-{output.name}-{os.getpid() if work is None else key}")
-    )
-    folder = beside if work is None else work / name
-    scratch = folder.local or beside.path / "cut"
-    try:
-        with copies_in(beside.path / "copies"):
-            yield folder, scratch
-    finally:
-        remove_spool(scratch)
-        beside.remove()
+    with passing_folder(output.with_name(f"tiles-{output.name}-")) as beside:
+        folder = LocalFolder(beside / "tiles") if work is None else work / f"tiles-{key}"
+        scratch = folder.local or beside / "cut"
+        writing = beside / "written"
+        writing.mkdir(parents=True)
+        try:
+            with copies_in(beside / "copies"):
+                yield _Places(tiles=folder, scratch=scratch, writing=writing)
+        finally:
+            remove_spool(scratch)
 
 
 def _pieces(cloud: Pieces, job: FilterJob, books: Books, mark: bool) -> Pieces:
@@ -260,12 +267,7 @@ def _filter_document(job: FilterJob, books: Books, written: int, mark: bool) -> 
 
 
 def _filtered_on_tiles(
-    input: Path,
-    stamp: Stamp,
-    job: FilterJob,
-    room: Room,
-    places: tuple[Folder, Path],
-    progress: Progress,
+    input: Path, stamp: Stamp, job: FilterJob, room: Room, places: _Places, progress: Progress
 ) -> tuple[Books, Pieces]:
     """Return what was decided about every point of the file, and its points once more."""
     books, spool = filter_chunks(
@@ -274,8 +276,8 @@ def _filtered_on_tiles(
         points=describe(input).points,
         room=room,
         waiting=0,
-        folder=places[0],
-        scratch=places[1],
+        folder=places.tiles,
+        scratch=places.scratch,
         progress=progress,
     )
     return books, partial(_decoded, input, stamp) if spool is None else spool.pieces

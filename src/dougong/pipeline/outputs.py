@@ -1,9 +1,7 @@
 """Results appear whole or not at all: files and folders are made beside and then renamed."""
 
-import glob
 import json
 import os
-import platform
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -11,7 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from dougong.errors import InputError, OutputError
-from dougong.formats import WRITABLE, part_of
+from dougong.formats import WRITABLE
+from dougong.formats.unfinished import (
+    clear_left,
+    clear_parts,
+    is_another_at_it,
+    marked,
+    own_mark,
+    part_of,
+)
 
 _unfinished: set[Path] = set()
 
@@ -137,6 +143,7 @@ def write_text(path: Path, text: str) -> None:
     part = part_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        clear_parts(path)
         with part.open("w", encoding="utf-8", errors="backslashreplace") as file:
             file.write(text)
             file.flush()
@@ -169,17 +176,22 @@ def watched(*paths: Path) -> Iterator[None]:
         _unfinished.difference_update(parts)
 
 
-def _is_another_running(process: int) -> bool:
-    """Say whether another process of this machine has this number (asked on POSIX only)."""
-    if process == os.getpid():
-        return False
+@contextmanager
+def passing_folder(head: Path) -> Iterator[Path]:
+    """Yield a folder, `head` and our mark, that is removed at the end, however the block ends.
+
+    What a killed process left under the same head goes first.
+    """
+    folder = head.with_name(head.name + own_mark())
+    clear_left(head)
+    # Our own number from an earlier life: containers count from 1 each time.
+    shutil.rmtree(folder, ignore_errors=True)
+    _unfinished.add(folder)
     try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        _unfinished.discard(folder)
 
 
 def _refuse_second_writer(out: Path) -> None:
@@ -190,16 +202,14 @@ def _refuse_second_writer(out: Path) -> None:
     OutputError
         Another process is at it, or may be (on another machine).
     """
-    if os.name != "posix":  # there, asking whether a process lives would end it
+    if os.name != "posix":
         return
-    head = f".{out.name}.part-"
-    for old in out.parent.glob(glob.escape(head) + "*"):
-        host, _, process = old.name.removeprefix(head).rpartition("-")
-        is_ours = host == platform.node() and process.isdigit()
+    for old, mark in marked(out.with_name(f".{out.name}.part-")):
         # Our own number from an earlier life (containers count from 1 each time) is stale too.
-        if is_ours and old not in _unfinished and not _is_another_running(int(process)):
+        if old not in _unfinished and not is_another_at_it(mark):
             shutil.rmtree(old, ignore_errors=True)
             continue
+        host, _, process = mark.rpartition("-")
         msg = (
             f"{out} is being written by another dougong (process {process} on {host or 'a host'}). "
             f"Wait for it or choose another --out; if it is gone, delete {old}."
@@ -220,7 +230,7 @@ def result_folder(out: Path) -> Iterator[Path]:
     OutputError
         The folder cannot be made, or another process is writing to `out`.
     """
-    part = out.with_name(f".{out.name}.part-{platform.node()}-{os.getpid()}")
+    part = out.with_name(f".{out.name}.part-{own_mark()}")
     if out.exists() and not out.is_dir():
         msg = f"{out} is a file, and the result is a folder. Choose another --out."
         raise OutputError(msg)

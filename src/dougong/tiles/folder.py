@@ -6,7 +6,6 @@ synced and renamed; an object store shows what it is sent in one request only wh
 
 import os
 import shutil
-import socket
 from collections.abc import Callable, Hashable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import IO, Protocol
 
 from dougong.errors import OutputError
+from dougong.formats.unfinished import part_of
 
 Fill = Callable[[IO[bytes]], object]
 """Writes what a file shall hold."""
@@ -106,7 +106,7 @@ class LocalFolder:
     def write(self, name: str, fill: Fill) -> None:
         """Write a file beside its place and rename it there."""
         path = self.path / name
-        part = path.with_name(f"{name}.part-{socket.gethostname()}-{os.getpid()}")
+        part = part_of(path)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             with part.open("wb") as file:

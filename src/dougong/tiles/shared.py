@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from dougong.errors import InputError, OutputError
-from dougong.formats.atomic import part_of
+from dougong.formats.unfinished import part_of
 from dougong.tiles.folder import Fill, Folder, LocalFolder
 
 _END_BYTES = 1 << 16
