@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dougong.formats.model import FileInfo, as_triple
-from dougong.formats.registry import kind_of, scans_of
-from dougong.formats.stream import Scan, Survey, survey_of
+from dougong.formats.registry import file_survey, kind_of, scans_of
+from dougong.formats.remembered import Remembered
+from dougong.formats.stream import Scan, Survey
 from dougong.formats.units import units_of
 
 _ROWS = 1_000_000
+_described: Remembered[FileInfo] = Remembered()
 
 
 def describe(path: Path | str) -> FileInfo:
     """Return what a point cloud file holds.
 
     LAS, LAZ and COPC headers tell everything. The others are passed over once in blocks for
-    their extent, which no header of theirs promises, and for the rows that have no coordinates.
+    their extent, which no header of theirs promises, and for the rows that have no coordinates;
+    asked again, the answer is remembered until the file is changed.
 
     Raises
     ------
@@ -32,8 +36,12 @@ def describe(path: Path | str) -> FileInfo:
         from dougong.formats import las
 
         return las.describe(path)
-    scans = scans_of(path, kind)
-    return _info(path, kind, scans, survey_of(scans, _ROWS))
+
+    def asked() -> FileInfo:
+        scans = scans_of(path, kind)
+        return _info(path, kind, scans, file_survey(path, scans))
+
+    return replace(_described.of(path, asked), path=path)
 
 
 def _info(path: Path, kind: str, scans: list[Scan], survey: Survey) -> FileInfo:

@@ -5,14 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dougong.cloud import Cloud, Pieces, in_pieces, joined_pieces
 from dougong.errors import FormatError, FrameError, InputError, OutputError
 from dougong.formats.model import Hold, Written
-from dougong.formats.stream import Scan, iterate_scans, opened, read_scans, stem_of
+from dougong.formats.remembered import Remembered
+from dougong.formats.stream import (
+    Scan,
+    Survey,
+    iterate_scans,
+    opened,
+    read_scans,
+    stem_of,
+    survey_of,
+)
 from dougong.formats.units import is_same_crs, metre_form
 
 SUFFIXES = {
@@ -87,6 +96,31 @@ def scans_of(path: Path, kind: str) -> list[Scan]:
     from dougong.formats.text import open_text
 
     return [open_text(path)]
+
+
+class _Found(NamedTuple):
+    """What one pass over a file finds."""
+
+    survey: Survey
+    notes: tuple[tuple[str, ...], ...]
+    """Of each scan: some are known at the end of the pass only."""
+
+
+_found: Remembered[_Found] = Remembered()
+
+
+def file_survey(path: Path, scans: Sequence[Scan]) -> Survey:
+    """Return what one pass over `scans`, all of the file, finds; the file is passed over once."""
+
+    def ask() -> _Found:
+        survey = survey_of(scans, BLOCK_ROWS)
+        return _Found(survey, tuple(scan.notes for scan in scans))
+
+    found = _found.of(path, ask)
+    for scan, notes in zip(scans, found.notes, strict=True):
+        if scan.notes != notes:
+            scan.notes = notes
+    return found.survey
 
 
 def read_stations(path: Path | str) -> list[Cloud]:
@@ -177,8 +211,8 @@ def iterate(path: Path | str, chunk_points: int = 1_000_000) -> Iterator[Cloud]:
     """Yield a file in clouds of at most `chunk_points` points that share one frame.
 
     The file is never held as a whole (PCD binary_compressed is one block by design: it is).
-    All but LAS are passed over twice. Scans of an E57 or PTX file follow one another;
-    `cloud.header.station` tells them apart.
+    All but LAS are passed over twice, once where that was done before and is remembered. Scans of
+    an E57 or PTX file follow one another; `cloud.header.station` tells them apart.
 
     Raises
     ------
@@ -193,7 +227,12 @@ def iterate(path: Path | str, chunk_points: int = 1_000_000) -> Iterator[Cloud]:
         from dougong.formats import las
 
         return las.iterate(path, chunk_points)
-    return iterate_scans(scans_of(path, kind), chunk_points)
+    return _surveyed(path, scans_of(path, kind), chunk_points)
+
+
+def _surveyed(path: Path, scans: list[Scan], rows: int) -> Iterator[Cloud]:
+    # A generator: the pass is made when the first cloud is asked for.
+    yield from iterate_scans(scans, rows, file_survey(path, scans))
 
 
 def family_of(path: Path) -> str:
