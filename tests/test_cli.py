@@ -378,6 +378,21 @@ def test_commands_are_listed_in_the_order_of_a_survey(capsys):
     assert at == sorted(at)
 
 
+def test_help_and_docs_name_the_commands_that_take_no_notice_of_memory(capsys):
+    """`check --memory 1GB` was accepted, and held what it liked."""
+    commands = ROOT / "src" / "dougong" / "cli"
+    deaf = [
+        name for name in COMMANDS
+        if "memory_bytes()" not in (commands / f"{name}.py").read_text(encoding="utf-8")
+    ]  # fmt: skip
+    assert call(["info", "--help"]) == 0
+    said = " ".join(capsys.readouterr().out.replace("\u2502", " ").split())
+    assert f"Without effect on {', '.join(deaf[:-1])} and {deaf[-1]}." in said
+    quoted = [f"`{name}`" for name in deaf]
+    text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    assert f"Without effect on {', '.join(quoted[:-1])} and {quoted[-1]} |" in text
+
+
 def test_tables_set_figures_flush_right():
     text = table([["a", "1"], ["bb", "1,000"]], ["name", "points"])
     assert text.splitlines() == ["  name  points", "  a          1", "  bb     1,000"]

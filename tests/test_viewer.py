@@ -20,8 +20,9 @@ import dougong.report.render as rendering
 from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.filters.selection import Reason
-from dougong.formats import write
+from dougong.formats import read, write
 from dougong.pipeline.marking import CLUTTER_CLASS, GROUND_CLASS, NOISE_CLASS
+from dougong.pipeline.memory import Room
 from dougong.pipeline.pairs import read_pairs
 from dougong.report.figures import find_place
 from dougong.report.layers import BLUE, COLOURS, Cores, Layer, Removed
@@ -43,9 +44,10 @@ from dougong.report.payload import (
 )  # fmt: skip
 from dougong.report.picking import picking
 from dougong.report.server import Served, ViewServer, byte_range
-from dougong.report.streaming import items_of, prepare
+from dougong.report.streaming import Item, _streamable, items_of, prepare
 from dougong.report.viewer import view_3d, why_missing
 from test_report import building, registration, run_result
+from tile_scans import make_little_room, write_scan
 
 BEACONS = np.array([[3.0, -7.0, 7.0], [3.0, -4.0, 11.0]])
 """Two lone points above the building, 5 m apart."""
@@ -223,6 +225,23 @@ def test_view_refuses_what_it_cannot_show(tmp_path):
         items_of([tmp_path / "gone.laz"])
     with pytest.raises(InputError, match=r"no result\.json"):
         items_of([tmp_path])
+
+
+@pytest.mark.parametrize("suffix", [".e57", ".laz", ".ply"])
+def test_a_cloud_larger_than_memory_is_converted_in_pieces(tmp_path, monkeypatch, suffix):
+    """`view --memory` took no notice, and the whole cloud was held."""
+    path, notes = tmp_path / f"scan{suffix}", []
+    write(read(write_scan(tmp_path / "first.laz")), path)
+    item = Item(name="scan", path=path)
+    whole = _streamable(item, tmp_path / "whole.copc.laz", Room.of(10**10), notes.append, notes)
+    make_little_room(monkeypatch)
+    monkeypatch.setattr("dougong.report.streaming.read", None)
+    monkeypatch.setattr("dougong.pipeline.tiled.CHUNK_POINTS", 5000)
+    (tmp_path / "work").mkdir()
+    converted = tmp_path / "work" / "a.copc.laz"
+    made = _streamable(item, converted, Room.of(190_000), notes.append, notes)
+    assert read(made).records.tobytes() == read(whole).records.tobytes()
+    assert list(converted.parent.iterdir()) == [converted]
 
 
 @pytest.mark.skipif(why_missing() is not None, reason=f"no viewer: {why_missing()}")

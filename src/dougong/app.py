@@ -437,12 +437,19 @@ def view(
     work: Path | None,
     progress: Progress,
     pairs: Path | None = None,
+    memory_bytes: int | None = None,
 ) -> Viewing:
     """Serve clouds or result folders to the browser; see `dougong.report.viewing.open_view`."""
     from dougong.report.viewing import open_view
 
     return open_view(
-        paths, port=port, open_browser=open_browser, work=work, progress=progress, pairs=pairs
+        paths,
+        port=port,
+        open_browser=open_browser,
+        work=work,
+        progress=progress,
+        pairs=pairs,
+        memory_bytes=memory_bytes,
     )
 
 

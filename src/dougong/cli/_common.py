@@ -25,8 +25,15 @@ class Common:
     """Print one JSON document on stdout and nothing else."""
     threads: Annotated[int | None, Parameter(group=GLOBAL)] = None
     """Threads to use; default: all this process may use."""
-    memory: Annotated[str | None, Parameter(group=GLOBAL)] = None
-    """Memory to stay under, for example 4GB: larger clouds are worked on in tiles on disk."""
+    memory: Annotated[
+        str | None,
+        Parameter(
+            group=GLOBAL,
+            help="Memory to stay under, for example 4GB: larger clouds are worked on in tiles on "
+            "disk. Without effect on init, info, check, report, evaluate and bench.",
+        ),
+    ] = None
+    """Memory to stay under."""
     engine: Annotated[str, Parameter(group=GLOBAL)] = "local"
     """Who works on tiles: local, dask (processes of this machine) or dask://HOST:PORT."""
     work: Annotated[str | None, Parameter(group=GLOBAL)] = None

@@ -26,7 +26,8 @@ def command(
     """Open clouds or a result folder in the browser, at full size, until Ctrl-C.
 
     The page is served to this computer only (127.0.0.1). COPC files are streamed as they are;
-    other formats are converted to temporary COPC files first, which takes time and memory.
+    other formats are converted to temporary COPC files first, which takes time, and memory up
+    to --memory.
 
     Example: dougong view result
 
@@ -56,6 +57,7 @@ def command(
             work=common.local_work(),
             progress=progress,
             pairs=pairs,
+            memory_bytes=common.memory_bytes(),
         )
         opened.append(viewing)
         document = viewing.document

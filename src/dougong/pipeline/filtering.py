@@ -53,9 +53,9 @@ from dougong.pipeline.single import (
 from dougong.pipeline.steps import Filtered
 from dougong.pipeline.tiled import (
     TiledJob,
+    decoded,
     filter_chunks,
     is_too_large,
-    stations_of,
     tiled_job,
 )
 from dougong.threads import ahead
@@ -233,8 +233,7 @@ def _pieces(cloud: Pieces, job: FilterJob, books: Books, mark: bool) -> Pieces:
 
 def _decoded(input: Path, stamp: Stamp) -> Iterator[Cloud]:
     """Yield the chunks of a file, all its scans as one cloud, if it stays as it is meanwhile."""
-    (chunks,) = stations_of(input, split=False)
-    yield from chunks
+    yield from decoded(input)
     require_unchanged(input, stamp)
 
 

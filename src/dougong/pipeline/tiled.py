@@ -86,6 +86,18 @@ def stations_of(file: Path, *, split: bool) -> Iterator[Iterator[Cloud]]:
         yield chunks
 
 
+def decoded(file: Path) -> Iterator[Cloud]:
+    """Return the chunks of a file, all its scans as one cloud.
+
+    Raises
+    ------
+    FormatError, InputError
+        As `stations_of`.
+    """
+    (chunks,) = stations_of(file, split=False)
+    return chunks
+
+
 def len_stations(file: Path) -> int:
     """Return how many scans a file keeps apart."""
     return describe(file).stations if file.suffix.lower() in (".e57", ".ptx") else 1

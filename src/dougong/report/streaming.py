@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,9 @@ import numpy as np
 
 from dougong.errors import InputError
 from dougong.formats import FileInfo, describe, read, write
+from dougong.formats.model import Hold
+from dougong.pipeline.memory import Room
+from dougong.pipeline.tiled import decoded, is_too_large
 from dougong.report.documents import load_registration, load_result, replaced_inputs
 from dougong.report.layers import BLUE, COLOURS
 from dougong.report.looks import SIGNED_TITLE, SIGNED_WORDS, Look, look_at
@@ -127,7 +131,13 @@ def _pair(folder: Path, notes: list[str]) -> list[Item]:
     return [moved, Item(name=document["target"], path=target, reference=document["target"])]
 
 
-def prepare(paths: Sequence[Path], scratch: Path, say: Note, pairs: Path | None = None) -> Scene:
+def prepare(
+    paths: Sequence[Path],
+    scratch: Path,
+    say: Note,
+    pairs: Path | None = None,
+    room: Room | None = None,
+) -> Scene:
     """Return the page for some clouds; those that are no COPC files are converted into `scratch`.
 
     Parameters
@@ -139,6 +149,8 @@ def prepare(paths: Sequence[Path], scratch: Path, say: Note, pairs: Path | None 
         Told what takes time.
     pairs : Path, optional
         The CSV file that pairs picked in two clouds go to; what it holds already is shown.
+    room : Room, optional
+        Memory: a larger cloud is converted without ever holding it.
 
     Raises
     ------
@@ -152,7 +164,11 @@ def prepare(paths: Sequence[Path], scratch: Path, say: Note, pairs: Path | None 
         raise InputError(f"this installation has no viewer: {missing}.")
     items, notes = items_of(paths)
     picked, takes = _picking(items, pairs)
-    files = [_streamable(item, scratch, index, say, notes) for index, item in enumerate(items)]
+    room = room or Room.of(None)
+    files = [
+        _streamable(item, scratch / f"{index}.copc.laz", room, say, notes)
+        for index, item in enumerate(items)
+    ]
     sources: list[dict[str, Any]] = []
     clouds: list[dict[str, Any]] = []
     looks: list[Look] = []
@@ -307,15 +323,15 @@ def _shown_name(item: Item) -> str:
     return item.path.name if item.removed_of is None else f"what was {item.name}"
 
 
-def _streamable(item: Item, scratch: Path, index: int, say: Note, notes: list[str]) -> Path:
-    """Return the path of a COPC file with these points."""
+def _streamable(item: Item, converted: Path, room: Room, say: Note, notes: list[str]) -> Path:
+    """Return the path of a COPC file with these points: its own, or `converted`."""
     path = item.path
     info = describe(path)
     if info.format == "COPC":
         return path
     say(f"converting {_shown_name(item)} ({info.format}, {info.points:,} points) to COPC")
-    converted = scratch / f"{index}.copc.laz"
-    written = write(read(path), converted)
+    cloud = partial(decoded, path) if is_too_large(path, room, 0) else read(path)
+    written = write(cloud, converted, hold=Hold(room.held_points(), converted.parent))
     if item.removed_of is not None:
         return converted
     notes.append(

@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from dougong.errors import InputError
+from dougong.pipeline.memory import Room
 from dougong.pipeline.progress import Progress
 from dougong.report.server import ViewServer
 from dougong.report.streaming import Scene, prepare
@@ -35,10 +36,12 @@ def open_view(
     work: Path | None,
     progress: Progress,
     pairs: Path | None = None,
+    memory_bytes: int | None = None,
 ) -> Viewing:
     """Serve clouds or result folders to the browser of this computer.
 
-    `pairs` is the CSV file that places picked in two clouds go to.
+    `pairs` is the CSV file that places picked in two clouds go to. What is converted first stays
+    under `memory_bytes`.
 
     Raises
     ------
@@ -51,7 +54,7 @@ def open_view(
         work.mkdir(parents=True, exist_ok=True)
     scratch = TemporaryDirectory(prefix="dougong-view-", dir=work, ignore_cleanup_errors=True)
     try:
-        scene = prepare(paths, Path(scratch.name), progress.stage, pairs)
+        scene = prepare(paths, Path(scratch.name), progress.stage, pairs, Room.of(memory_bytes))
         server = _server(scene, port)
     except BaseException:
         scratch.cleanup()
