@@ -1,13 +1,16 @@
 """The merged cloud: per zone the better source, no hole at the seams, every point counted."""
 
+import tracemalloc
 from dataclasses import replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from dougong.cloud import Cloud, joined_pieces
 from dougong.formats.model import Hold
+from dougong.pipeline.left_out import LeftOut, Remaining
 from dougong.pipeline.merging import REASON, Merge, Part, better_of, choose
 from dougong.pipeline.sides import whole
 from dougong.pipeline.zones import grid_over, zones_of
@@ -16,7 +19,17 @@ QUICK = Merge(zone_m=0.5, reach_m=0.05)
 
 
 def better(one, other, params):
-    return better_of(whole(one, other), params)
+    found = better_of(whole(one, other), params)
+    masks = [
+        Remaining(gone, 0, len(points)).mask(0, len(points))
+        for gone, points in zip(found.left_out, (one, other), strict=True)
+    ]
+    return SimpleNamespace(kept_one=masks[0], kept_other=masks[1], note=found.note)
+
+
+def kept_of(chosen):
+    """One mask per part, over its points."""
+    return [remaining.mask(0, remaining.points) for remaining in chosen.remaining]
 
 
 def wall(rng, length, per_m2, noise, start=0.0, y=0.0):
@@ -135,13 +148,13 @@ def part_of(cloud, **told):
 def test_the_choice_knows_no_order_of_parts_or_points_and_no_offset(seam):
     scan, drone = seam
     parts = parts_of(scan, drone)
-    kept = choose(parts, QUICK).kept
+    kept = kept_of(choose(parts, QUICK))
     np.testing.assert_array_equal(kept[2], better(scan, drone, QUICK).kept_other)
-    np.testing.assert_array_equal(choose(parts[::-1], QUICK).kept[0], kept[2])
+    np.testing.assert_array_equal(kept_of(choose(parts[::-1], QUICK))[0], kept[2])
     turn = np.random.default_rng(3).permutation(len(drone))
     cloud = joined_pieces(parts[2].pieces).select(turn)
     mixed = [*parts[:2], replace(parts[2], pieces=lambda: (cloud,))]
-    np.testing.assert_array_equal(choose(mixed, QUICK).kept[2], kept[2][turn])
+    np.testing.assert_array_equal(kept_of(choose(mixed, QUICK))[2], kept[2][turn])
 
 
 def test_tiles_with_halos_choose_as_the_whole(seam, tmp_path):
@@ -152,11 +165,51 @@ def test_tiles_with_halos_choose_as_the_whole(seam, tmp_path):
     parts = parts_of(scan, drone)
     one, other = choose(parts, Merge()), choose(parts, Merge(), Hold(3000, tmp_path / "t"))
     assert one.reach_m == other.reach_m
-    for kept, again in zip(one.kept, other.kept, strict=True):
+    for kept, again in zip(kept_of(one), kept_of(other), strict=True):
         np.testing.assert_array_equal(kept, again)
-    assert not one.kept[1].all()
-    assert not one.kept[2].all()
+    assert not kept_of(one)[1].all()
+    assert not kept_of(one)[2].all()
+    assert other.document(parts) == one.document(parts)
     assert len(list(tmp_path.rglob("*.points.npz"))) >= 4
+
+
+@pytest.mark.parametrize("is_on_disk", [False, True])
+def test_places_in_pages_are_those_of_a_mask(tmp_path, monkeypatch, is_on_disk):
+    monkeypatch.setattr("dougong.pipeline.left_out.PAGE_POINTS", 100)
+    rng, n = np.random.default_rng(0), 1234
+    gone = rng.permutation(n)[:400]
+    left_out = LeftOut(tmp_path / "a" if is_on_disk else None)
+    for part in (*np.array_split(gone, 7), gone[:0]):
+        left_out.add(part)
+    expected = np.ones(n, dtype=bool)
+    expected[gone] = False
+    for first, points in ((0, n), (0, 0), (250, 700), (99, 2), (100, 100)):
+        part = Remaining(left_out, first, points)
+        here = expected[first : first + points]
+        np.testing.assert_array_equal(part.mask(0, points), here)
+        np.testing.assert_array_equal(part.mask(points // 3, points // 2),
+                                      here[points // 3 : points // 2])  # fmt: skip
+        assert part.gone() == np.count_nonzero(~here)
+
+
+def test_merging_on_tiles_holds_no_mask_of_all_points(seam, tmp_path):
+    """Two bytes a point were held whatever --memory said: 2 GB of a thousand million points."""
+    few = parts_of(*seam)
+    # A part of which nothing is ever read stands for the thousand million.
+    far = replace(few[0], points=10**9, pieces=lambda: (), name="far")
+    parts = [*few, far]
+    tracemalloc.start()
+    try:
+        chosen = choose(parts, QUICK, Hold(3000, tmp_path / "t"))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 50e6
+    assert chosen.document(parts)["sources"]["far"] == {"points": 10**9, "left_out": 0}
+    held = choose(few, QUICK)
+    for kept, again in zip(kept_of(held), kept_of(replace(chosen, remaining=chosen.remaining[:3])),
+                           strict=True):  # fmt: skip
+        np.testing.assert_array_equal(kept, again)
 
 
 def test_every_point_is_counted_and_comes_back(seam):
@@ -175,7 +228,7 @@ def test_every_point_is_counted_and_comes_back(seam):
 def test_one_kind_of_sensor_is_kept_whole(seam):
     parts = [replace(part, kind="lidar") for part in parts_of(*seam)]
     chosen = choose(parts, Merge())
-    assert all(kept.all() for kept in chosen.kept)
+    assert all(kept.all() for kept in kept_of(chosen))
     assert "one kind" in chosen.note
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -29,6 +30,7 @@ from dougong.cloud import Frame, Pieces
 from dougong.filters.neighbourhood import build_index, nearest
 from dougong.formats.model import Hold
 from dougong.params import Parameters
+from dougong.pipeline.left_out import LeftOut, Remaining
 from dougong.pipeline.sides import HALO_SHARE, Tiles, cut, whole
 from dougong.pipeline.zones import Zones, ZoneSums, grid_over
 from dougong.threads import ahead
@@ -78,8 +80,8 @@ class Part:
 class Merged:
     """What is kept of each part, and why the rest is not."""
 
-    kept: tuple[Mask, ...]
-    """One mask per part, over its points."""
+    remaining: tuple[Remaining, ...]
+    """Of each part."""
     mode: Literal["best", "all"]
     noise_m: dict[str, float] = field(default_factory=dict)
     """Median noise of the flat zones, by kind."""
@@ -89,10 +91,11 @@ class Merged:
     def document(self, parts: Sequence[Part]) -> dict[str, Any]:
         """Return the books: what was kept and left out of each source."""
         rows: dict[str, dict[str, int]] = {}
-        for part, kept in zip(parts, self.kept, strict=True):
+        for part, remaining in zip(parts, self.remaining, strict=True):
             row = rows.setdefault(part.name, {"points": 0, "left_out": 0})
-            row["points"] += int(kept.sum())
-            row["left_out"] += int((~kept).sum())
+            gone = remaining.gone()
+            row["points"] += part.points - gone
+            row["left_out"] += gone
         left_out = sum(row["left_out"] for row in rows.values())
         return {
             "mode": self.mode,
@@ -113,31 +116,37 @@ def choose(parts: Sequence[Part], params: Merge, hold: Hold | None = None) -> Me
     independent of the order of parts and points, of the tiles and of the thread count. Tile class:
     two-pass (zones, then their reach), halo twice the reach.
     """
-    everything = tuple(np.ones(part.points, dtype=bool) for part in parts)
+    remaining = [Remaining(LeftOut(), 0, part.points) for part in parts]
     if params.mode == "all":
-        return Merged(kept=everything, mode="all")
+        return Merged(remaining=tuple(remaining), mode="all")
     groups: dict[Kind, list[int]] = {}
     for place, part in enumerate(parts):
         if part.points:
             groups.setdefault(part.kind, []).append(place)
     if len(groups) < 2:
         note = "one kind of sensor only: nothing to choose between"
-        return Merged(kept=everything, mode="best", note=note)
+        return Merged(remaining=tuple(remaining), mode="best", note=note)
     kinds = sorted(groups)
     sets = [[parts[place] for place in groups[kind]] for kind in kinds]
-    found = better_of(_tiles_of(sets[0], sets[1], hold), params)
-    masks = list(everything)
-    for kind, kept in zip(kinds, (found.kept_one, found.kept_other), strict=True):
-        sizes = [parts[place].points for place in groups[kind]]
-        for place, mask in zip(groups[kind], np.split(kept, np.cumsum(sizes)[:-1]), strict=True):
-            masks[place] = mask
+    is_held = _are_held(sets, hold)
+    folder = None if is_held or hold is None else hold.folder / "merge"
+    found = better_of(_tiles_of(sets[0], sets[1], hold), params, folder)
+    for kind, left_out in zip(kinds, found.left_out, strict=True):
+        first = 0
+        for place in groups[kind]:
+            remaining[place] = Remaining(left_out, first, parts[place].points)
+            first += parts[place].points
     return Merged(
-        kept=tuple(masks),
+        remaining=tuple(remaining),
         mode="best",
         noise_m=dict(zip(kinds, found.noise_m, strict=True)),
         reach_m=found.reach_m,
         note=found.note,
     )
+
+
+def _are_held(sets: Sequence[Sequence[Part]], hold: Hold | None) -> bool:
+    return hold is None or sum(part.points for side in sets for part in side) <= hold.points
 
 
 def _tiles_of(one: Sequence[Part], other: Sequence[Part], hold: Hold | None) -> Tiles:
@@ -147,7 +156,7 @@ def _tiles_of(one: Sequence[Part], other: Sequence[Part], hold: Hold | None) -> 
         (piece.rebased(origin).xyz for part in side for piece in part.pieces())
         for side in (one, other)
     ]
-    if hold is None or sum(part.points for part in (*one, *other)) <= hold.points:
+    if hold is None or _are_held((one, other), hold):
         return whole(*(np.concatenate(list(stream)) for stream in streams))
     most = max(hold.points // HALO_SHARE, 1)
     return cut((streams[0], streams[1]), hold.folder / "merge", most)
@@ -155,34 +164,34 @@ def _tiles_of(one: Sequence[Part], other: Sequence[Part], hold: Hold | None) -> 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chosen:
-    """What is kept of two point sets."""
+    """What is left out of two point sets."""
 
-    kept_one: Mask
-    kept_other: Mask
+    left_out: tuple[LeftOut, LeftOut]
     noise_m: tuple[float, float]
     reach_m: float | None
     note: str = ""
 
 
-def better_of(tiles: Tiles, params: Merge) -> Chosen:
-    """Return which points of two sensors stay."""
+def better_of(tiles: Tiles, params: Merge, folder: Path | None = None) -> Chosen:
+    """Return which points of two sensors stay.
+
+    `folder` gets the places of those that do not; None: they are held.
+    """
     grid = grid_over(
         (points for sides in ahead(tiles(0.0)) for points in sides.points), params.zone_m
     )
-    sums, kept = (ZoneSums(grid), ZoneSums(grid)), [0, 0]
+    sums = (ZoneSums(grid), ZoneSums(grid))
     for sides in ahead(tiles(0.0)):
         for side in (0, 1):
-            kept[side] += len(sides.rows[side])
             if len(sides.rows[side]):
                 sums[side].add(sides.own(side))
     zones = (sums[0].zones(), sums[1].zones())
-    masks = (np.ones(kept[0], dtype=bool), np.ones(kept[1], dtype=bool))
+    one, other = (None if folder is None else folder / f"left-out-{k}" for k in (0, 1))
+    left_out = (LeftOut(one), LeftOut(other))
     noise = (zones[0].typical_noise_m, zones[1].typical_noise_m)
     if not np.isfinite(noise).all():
         note = "a cloud has no flat zone to judge its noise by: every point was kept"
-        return Chosen(
-            kept_one=masks[0], kept_other=masks[1], noise_m=noise, reach_m=None, note=note
-        )
+        return Chosen(left_out=left_out, noise_m=noise, reach_m=None, note=note)
     good = 0 if noise[0] <= noise[1] else 1
     rule = _Rule(
         better=zones[good],
@@ -195,8 +204,8 @@ def better_of(tiles: Tiles, params: Merge) -> Chosen:
         lost = _lost(sides.points[good], sides.points[1 - good], reach, rule)
         for side, is_lost in ((good, lost[0]), (1 - good, lost[1])):
             own = sides.rows[side]
-            masks[side][own] = ~is_lost[: len(own)]
-    return Chosen(kept_one=masks[0], kept_other=masks[1], noise_m=noise, reach_m=reach)
+            left_out[side].add(own[is_lost[: len(own)]])
+    return Chosen(left_out=left_out, noise_m=noise, reach_m=reach)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

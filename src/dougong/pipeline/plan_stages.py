@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from dougong.pipeline.left_out import PLACE_BYTES
 from dougong.pipeline.memory import (
     Room,
     estimated_bytes,
@@ -158,7 +159,7 @@ def stages_after(
             ("distances", 0, registering, 0, _DISTANCE_SECONDS * pairs),
         ]
         tiles = _tiles(points, most) if is_cut else 0
-        disk = points * TILE_ROW_BYTES if is_cut else 0
+        disk = points * (TILE_ROW_BYTES + PLACE_BYTES) if is_cut else 0
         rows.append(("merge", tiles, parts if is_cut else whole, disk, _MERGE * millions))
     tail = parts if is_cut else whole
     rows.append(("write", 0, tail, 2 * records if is_cut else 0, 2.0 * _WRITE * millions))

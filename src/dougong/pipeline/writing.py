@@ -9,12 +9,12 @@ from dougong.formats import write, write_merged
 from dougong.formats.model import Hold
 from dougong.pipeline.distances import Painter
 from dougong.pipeline.exports import Ends, write_registration
+from dougong.pipeline.left_out import Remaining
 from dougong.pipeline.links import Linked
 from dougong.pipeline.merging import Merge, Merged, Part, choose
 from dougong.pipeline.movers import Mover
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import Clock
-from dougong.typing import Mask
 
 MERGED = "merged.copc.laz"
 REMOVED = "removed"
@@ -65,7 +65,10 @@ def write_clouds(
     progress.stage(f"writing {MERGED}")
     with clock.measure("write"):
         written = write_merged(
-            [_left(pieces, kept) for pieces, kept in zip(painted, chosen.kept, strict=True)],
+            [
+                _left(pieces, remaining)
+                for pieces, remaining in zip(painted, chosen.remaining, strict=True)
+            ],
             out / MERGED,
             source_ids=[part.source_id for part in parts],
             hold=hold,
@@ -87,13 +90,13 @@ def _merged_document(parts: Sequence[Part], chosen: Merged, progress: Progress) 
     return {**document, "clouds": list(ids), "source_ids": ids}
 
 
-def _left(pieces: Pieces, kept: Mask) -> Pieces:
-    """Return the pieces of a cloud without the points that are not `kept`."""
+def _left(pieces: Pieces, remaining: Remaining) -> Pieces:
+    """Return the pieces of a cloud without the points that do not remain."""
 
     def left() -> Iterator[Cloud]:
         done = 0
         for piece in pieces():
-            here = kept[done : done + len(piece)]
+            here = remaining.mask(done, done + len(piece))
             done += len(piece)
             yield piece if here.all() else piece.select(here)
 
