@@ -14,7 +14,7 @@ from dougong.pipeline.distances import (
     measure,
     write_distances,
 )
-from dougong.pipeline.registrations import finite
+from dougong.pipeline.outputs import finite
 from dougong.registration.result import FineResult, Registration
 from test_registration_faces import house
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dougong.typing import Index
 
+Scalar = TypeVar("Scalar", bound=np.generic)
 Number = TypeVar("Number", bound=np.integer[Any])
 _KEY_BITS = 64
 _SIGN = np.uint64(1 << 63)
@@ -39,6 +40,13 @@ def sorted_places(keys: NDArray[np.uint64] | NDArray[np.int64]) -> Index:
         spare = np.empty(len(keys), np.uint64)
         radix_argsort(keys.view(np.uint64) ^ sign, _KEY_BITS, places, np.empty_like(places), spare)
     return places
+
+
+def unsorted(values: NDArray[Scalar], order: Index) -> NDArray[Scalar]:
+    """Return `values` (n, ...), whose i-th belongs to place ``order[i]``, by place."""
+    result = np.empty_like(values)
+    result[order] = values
+    return result
 
 
 def by_coordinates(points: NDArray[np.float64]) -> Index:

@@ -72,7 +72,7 @@ def info(files: Sequence[Path], *, progress: Progress) -> Document:
         The only file cannot be read.
     """
     from dougong.formats import describe
-    from dougong.pipeline.registrations import finite
+    from dougong.pipeline.outputs import finite
 
     _need_files(files)
     found = []

@@ -7,7 +7,7 @@ Selecting selects both. A writer emits the records; only a moved cloud gets new 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -361,7 +361,11 @@ def in_pieces(cloud: Cloud | Pieces) -> Pieces:
 
 def joined_pieces(pieces: Pieces) -> Cloud:
     """Return a cloud that comes in pieces as a whole."""
-    parts = list(pieces())
+    return joined(list(pieces()))
+
+
+def joined(parts: Sequence[Cloud]) -> Cloud:
+    """Return clouds of one frame and layout, at least one, as one."""
     if len(parts) == 1:
         return parts[0]
     return replace(

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from dougong.evaluation import drone, scanner
 from dougong.evaluation.buildings.roofs import Slope, hipped
-from dougong.evaluation.hard_trials import Trial, inverse, moved, pose
+from dougong.evaluation.hard_trials import Trial, pose
 from dougong.evaluation.mesh import CLUTTER, FINE, GROUND, SURFACE, Mesh, Tracer, join
 from dougong.evaluation.metrics import Truth
 from dougong.evaluation.site import foliage, trunks
 from dougong.evaluation.solids import beam, block, box, lathe
+from dougong.registration.overlap import apply, inverse
 from dougong.typing import Points
 
 Spots = NDArray[np.float64]
@@ -78,13 +79,13 @@ def make_trial(
             params = scanner.Scanner(points=lidar_points)
             clouds.append(scanner.scan(tracer, stations, params, rng))
     T = pose(rng)
-    source = moved(T, clouds[0].xyz)
+    source = apply(T, clouds[0].xyz)
     still = np.isin(clouds[0].labels, (SURFACE, FINE, GROUND))
     surface = clouds[0].xyz[still][::20]
     truth = Truth(
         T_target_source=inverse(T),
         T_best=inverse(T),
-        surface_points=moved(T, surface),
+        surface_points=apply(T, surface),
         surface_bent=surface,
     )
     return Trial(

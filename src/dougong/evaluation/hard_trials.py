@@ -14,6 +14,7 @@ from dougong.evaluation.mesh import FINE, GROUND, SURFACE
 from dougong.evaluation.metrics import Truth, fit_rigid
 from dougong.evaluation.scenes import Scene
 from dougong.evaluation.survey import rotation
+from dougong.registration.overlap import apply, inverse
 
 Points = NDArray[np.float64]
 _SEEN_M = 0.3
@@ -55,29 +56,15 @@ def base_of(scene: Scene) -> Base:
     best[:3, 3] -= origin
     labels = [cloud.attribute("truth_label") for cloud in (scene.lidar, scene.photogrammetry)]
     return Base(
-        lidar=moved(T, scene.lidar.frame.to_file(scene.lidar.xyz)),
+        lidar=apply(T, scene.lidar.frame.to_file(scene.lidar.xyz)),
         drone=drone - origin,
         lidar_label=np.asarray(labels[0]),
         drone_label=np.asarray(labels[1]),
         station=np.asarray(scene.lidar.attribute("station"), dtype=np.int64),
-        surface=moved(T, scene.truth.surface_points),
+        surface=apply(T, scene.truth.surface_points),
         bent=scene.truth.surface_bent - origin,
         T_best=best @ inverse(T),
     )
-
-
-def moved(T: Points, points: Points) -> Points:
-    """Return `points` (n, 3) moved by the affine `T` (4, 4)."""
-    result: Points = points @ T[:3, :3].T + T[:3, 3]
-    return result
-
-
-def inverse(T: Points) -> Points:
-    """Return the inverse of the rigid `T`."""
-    result = np.eye(4)
-    result[:3, :3] = T[:3, :3].T
-    result[:3, 3] = -T[:3, :3].T @ T[:3, 3]
-    return result
 
 
 def pose(rng: np.random.Generator, tilt_deg: float = 0.4) -> Points:
@@ -96,7 +83,7 @@ def truth_of(base: Base, T: Points, inside: Callable[[Points], Any] | None = Non
     The best rigid pose is that of the judged surface: a part is laid on the part as it was bent.
     """
     chosen = np.ones(len(base.surface), bool) if inside is None else inside(base.surface)
-    surface, bent = moved(T, base.surface[chosen]), base.bent[chosen]
+    surface, bent = apply(T, base.surface[chosen]), base.bent[chosen]
     return Truth(
         T_target_source=inverse(T),
         T_best=base.T_best @ inverse(T) if inside is None else fit_rigid(surface, bent),
@@ -113,7 +100,7 @@ def exact(base: Base, T: Points) -> Truth:
 def plain(base: Base, rng: np.random.Generator, tilt_deg: float = 0.4) -> Trial:
     """Take both whole clouds, the scanner off level by `tilt_deg`."""
     T = pose(rng, tilt_deg)
-    return Trial(source=moved(T, base.lidar), target=base.drone, truth=truth_of(base, T))
+    return Trial(source=apply(T, base.lidar), target=base.drone, truth=truth_of(base, T))
 
 
 def overlap(share: float) -> Callable[[Base, np.random.Generator], Trial]:
@@ -124,7 +111,7 @@ def overlap(share: float) -> Callable[[Base, np.random.Generator], Trial]:
         a, b = low + np.array([0.5 - share / 2, 0.5 + share / 2]) * (high - low)
         T = pose(rng)
         return Trial(
-            source=moved(T, base.lidar[base.lidar[:, 0] < b]),
+            source=apply(T, base.lidar[base.lidar[:, 0] < b]),
             target=base.drone[base.drone[:, 0] > a],
             truth=truth_of(base, T, lambda x: (x[:, 0] > a) & (x[:, 0] < b)),
         )
@@ -146,7 +133,7 @@ def part(base: Base, rng: np.random.Generator) -> Trial:
         return np.hypot(*(x[:, :2] - corner).T) < 13.0
 
     T = pose(rng)
-    source = moved(T, base.lidar[near(base.lidar)])
+    source = apply(T, base.lidar[near(base.lidar)])
     return Trial(source=source, target=base.drone, truth=truth_of(base, T, near))
 
 
@@ -158,7 +145,7 @@ def one_station(base: Base, rng: np.random.Generator) -> Trial:
         return cKDTree(first).query(x, distance_upper_bound=_SEEN_M)[0] < np.inf
 
     T = pose(rng)
-    return Trial(source=moved(T, first), target=base.drone, truth=truth_of(base, T, seen))
+    return Trial(source=apply(T, first), target=base.drone, truth=truth_of(base, T, seen))
 
 
 def outliers(base: Base, rng: np.random.Generator) -> Trial:
@@ -178,7 +165,7 @@ def sloping(base: Base, rng: np.random.Generator) -> Trial:
     shear[2, :2] = 0.12, 0.09
     clouds = ("lidar", "drone", "surface", "bent")
     # T_best stays: bending shears along, by less than a millimetre.
-    changed: dict[str, Any] = {name: moved(shear, getattr(base, name)) for name in clouds}
+    changed: dict[str, Any] = {name: apply(shear, getattr(base, name)) for name in clouds}
     return plain(replace(base, **changed), rng)
 
 
@@ -223,7 +210,7 @@ def two_flights(base: Base, rng: np.random.Generator) -> Trial:
     T, first = pose(rng), rng.random(len(base.drone)) < 0.5
     rest = base.drone[~first]
     return Trial(
-        source=moved(T, base.drone[first]),
+        source=apply(T, base.drone[first]),
         target=rest + rng.normal(0.0, 0.01, rest.shape),
         truth=exact(base, T),
         source_kind="photogrammetry",
@@ -234,7 +221,7 @@ def two_scans(base: Base, rng: np.random.Generator) -> Trial:
     """Pair even stations with odd ones."""
     T, even = pose(rng), base.station % 2 == 0
     return Trial(
-        source=moved(T, base.lidar[even]),
+        source=apply(T, base.lidar[even]),
         target=base.lidar[~even],
         truth=exact(base, T),
         target_kind="lidar",
@@ -255,7 +242,7 @@ def halls(of_source: int, of_target: int) -> Callable[..., Trial]:
 
         T = pose(rng)
         return Trial(
-            source=moved(T, row(base.lidar, of_source)),
+            source=apply(T, row(base.lidar, of_source)),
             target=row(base.drone, of_target),
             truth=truth_of(base, T),
         )
@@ -308,7 +295,7 @@ def facade(base: Base, rng: np.random.Generator) -> Trial:
         return (before < 3.0) & (before > -2.0)
 
     T = pose(rng)
-    source = moved(T, base.lidar[near(base.lidar)])
+    source = apply(T, base.lidar[near(base.lidar)])
     return Trial(source=source, target=base.drone, truth=truth_of(base, T, near))
 
 
@@ -335,7 +322,7 @@ def doorway(base: Base, rng: np.random.Generator) -> Trial:
     through = 2.0 / np.maximum(ahead, 1e-9)
     is_seen = (ahead > 2.0) & (ahead < 14.0) & (np.abs(aside * through) < 0.8)
     is_seen &= (above * through > -1.6) & (above * through < 0.6)
-    source = moved(pose(rng), np.vstack([inside, base.lidar[is_seen]]))
+    source = apply(pose(rng), np.vstack([inside, base.lidar[is_seen]]))
     return Trial(source=source, target=base.drone, truth=None)
 
 

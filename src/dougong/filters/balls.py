@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dougong._checks import as_points
+from dougong._sorting import unsorted
 from dougong.errors import InputError
 from dougong.filters.octree_voxel_grid import runs_of_cells
 from dougong.threads import for_blocks
@@ -49,9 +50,7 @@ class Lattice(NamedTuple):
 
     def unsorted(self, values: NDArray[np.float64]) -> Values:
         """Return per-point `values`, given in sorted order, in the caller's order."""
-        result = np.empty_like(values)
-        result[self.order] = values
-        return result
+        return unsorted(values, self.order)
 
 
 def build_lattice(points: ArrayLike, radius_m: float) -> Lattice:

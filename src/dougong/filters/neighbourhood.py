@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dougong._boxes import corners_of
 from dougong._checks import as_points
+from dougong._sorting import unsorted
 from dougong.errors import InputError
 from dougong.kernels import boxtree, moments, neighbours, order, self_neighbours
 from dougong.threads import for_blocks
@@ -43,9 +44,7 @@ class Neighbourhood(NamedTuple):
 
     def unsorted(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
         """Return `values` (n, ...) of the points in sorted order in the caller's order."""
-        result = np.empty_like(values)
-        result[self.order] = values
-        return result
+        return unsorted(values, self.order)
 
 
 class Surface(NamedTuple):

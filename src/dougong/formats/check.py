@@ -1,7 +1,7 @@
 """Find what is wrong with a point cloud file, and say what to do about it.
 
 One pass in chunks. Kept per point: 8 bytes for the duplicates; kept of the cloud: every k-th
-point for the robust box.
+point for the wide box.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from dougong.formats.faults import (
     coordinate_hashes,
     copies_among,
     counted,
-    robust_box,
     unit_suspicion,
+    wide_box,
 )
 from dougong.formats.model import FileInfo, Finding
 from dougong.formats.projection import projection_problem
@@ -208,7 +208,7 @@ def _of_points(path: Path, info: FileInfo, tally: _Tally) -> list[Finding]:
         found.append(Finding("warning", text))
     elif suspicion := unit_suspicion(sample, tally.frame):
         found.append(Finding("warning", f"{path.name}: {suspicion}"))
-    low, high = robust_box(sample)
+    low, high = wide_box(sample)
     is_inside_origin = bool(((-origin >= low) & (-origin <= high)).all())
     if tally.at_origin and (tally.at_origin > 1 or not is_inside_origin):
         text = (

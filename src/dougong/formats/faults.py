@@ -16,7 +16,7 @@ COARSE_M = 0.01
 FEW = 100
 """Fewer points prove nothing about how they were stored, and hold no site."""
 SAMPLE = 200_000
-"""Points that shape the robust box."""
+"""Points that shape the wide box."""
 NO_SYSTEM = "no coordinate reference system is named; its numbers are taken as metres."
 _FAR_FACTOR = 10.0
 _FAR_LEAST_M = 100.0
@@ -63,7 +63,7 @@ def _places(sample: Points) -> Points:
     return sample if len(first) == len(sample) else sample[first]
 
 
-def robust_box(sample: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def wide_box(sample: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the box of the middle 98 % grown on all sides by ten times its longest edge."""
     low, high = np.quantile(_places(sample), [0.01, 0.99], axis=0)
     margin = max(_FAR_LEAST_M, _FAR_FACTOR * float((high - low).max()))
@@ -116,7 +116,7 @@ def faults_of(cloud: Cloud) -> tuple[str, ...]:
         cloud.frame,
         points=len(cloud),
         copies=copies_in(cloud.xyz),
-        far=points_beyond(cloud.xyz, *robust_box(sample)),
+        far=points_beyond(cloud.xyz, *wide_box(sample)),
         sample=sample,
     )
 

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong.cloud import Cloud
+from dougong.pipeline.ground import MAP_SIZE_M, do_meet, plan_box
 from dougong.registration import Register
 from dougong.registration.plan_search import plan_search
 from dougong.registration.prepare import prepare
 from dougong.registration.result import Registration
 from dougong.typing import Kind, Values
 
-_MAP_SIZE_M = 1e5
 _MIRRORS: dict[str, tuple[NDArray[np.float64], str]] = {
     "x and y are swapped": (
         np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]),
@@ -50,30 +50,20 @@ def mirrored_axes(source: Cloud, target: Cloud) -> str | None:
     """
     if not len(source) or not len(target):
         return None
-    one, two = _plan_box(source), _plan_box(target)
-    if min(np.abs(box).max() for box in (one, two)) < _MAP_SIZE_M or _meet(one, two):
+    one, two = plan_box(source), plan_box(target)
+    if min(np.abs(box).max() for box in (one, two)) < MAP_SIZE_M or do_meet(one, two):
         return None
     for fault, (matrix, advice) in _MIRRORS.items():
-        if not _meet(np.sort(one @ matrix[:2, :2].T, axis=0), two):
+        if not do_meet(np.sort(one @ matrix[:2, :2].T, axis=0), two):
             continue
         guilty, other = (target, source) if source.frame.crs and not target.frame.crs else (
             source, target)  # fmt: skip
-        x, y = _plan_box(guilty).mean(axis=0)
+        x, y = plan_box(guilty).mean(axis=0)
         return (
             f"{guilty.name} is a mirror image of the site: {fault} (x = {x:.0f}, y = {y:.0f}) "
             f"against {other.name}. {advice}."
         )
     return None
-
-
-def _plan_box(cloud: Cloud) -> NDArray[np.float64]:
-    """Return the low and high plan corner (2, 2) without the outermost points, metres."""
-    box = np.column_stack([np.quantile(axis, [0.02, 0.98]) for axis in cloud.xyz.T])
-    return (box + cloud.frame.origin)[:, :2]
-
-
-def _meet(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    return bool(((one[0] <= other[1]) & (other[0] <= one[1])).all())
 
 
 def upside_down(

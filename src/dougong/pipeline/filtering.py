@@ -24,7 +24,7 @@ from dougong.params import Parameters
 from dougong.pipeline.books import Books, Tally
 from dougong.pipeline.marking import GROUND_CLASS, marked, marks_clutter, with_classes, with_clutter
 from dougong.pipeline.memory import Room
-from dougong.pipeline.outputs import passing_folder, refuse_output, watched, write_json
+from dougong.pipeline.outputs import finite, passing_folder, refuse_output, watched, write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import (
     Clock,
@@ -41,7 +41,6 @@ from dougong.pipeline.recipes import (
     filter_cloud,
     steps_of,
 )
-from dougong.pipeline.registrations import finite
 from dougong.pipeline.settings import parse_overrides, updated
 from dougong.pipeline.single import (
     filter_name,

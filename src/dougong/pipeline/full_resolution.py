@@ -7,11 +7,10 @@ from typing import Any
 
 from dougong.cloud import Frame
 from dougong.formats import PlacedStation, Written, copy_file, is_same_crs, reissue, scans_in
-from dougong.pipeline.outputs import write_json
+from dougong.formats.stream import stem_of
+from dougong.pipeline.outputs import finite, write_json
 from dougong.pipeline.progress import Progress
-from dougong.pipeline.project import stem
 from dougong.pipeline.provenance import software
-from dougong.pipeline.registrations import finite
 from dougong.typing import Transform
 
 FOLDER = "full"
@@ -39,7 +38,7 @@ def output_names(files: Sequence[tuple[str, Path]]) -> list[str]:
 
     Files of the same stem get their cloud's name in front, and a number where that is not enough.
     """
-    stems = [stem(path) for _, path in files]
+    stems = [stem_of(path) for _, path in files]
     names: list[str] = []
     for (entry, _), own in zip(files, stems, strict=True):
         name = own if stems.count(own) == 1 else f"{entry}-{own}"

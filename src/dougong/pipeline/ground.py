@@ -33,7 +33,7 @@ Places = TypeVar("Places", PickedPairs, ControlPoints)
 Setting = Literal["auto", "off"] | float
 NEGLIGIBLE_PPM = 10.0
 """1 mm in 100 m, what a good scanner's own scale is known to: such maps count as true to scale."""
-_MAP_SIZE_M = 1e5
+MAP_SIZE_M = 1e5
 """Coordinates from here on are a map's rather than a scanner's."""
 
 
@@ -162,17 +162,23 @@ def _is_one_map(source: Cloud, target: Cloud, one: GridScale | None, two: GridSc
 
 
 def _is_map_sized(cloud: Cloud) -> bool:
-    return len(cloud) > 0 and bool(np.abs(_middle(cloud)[:2]).max() >= _MAP_SIZE_M)
+    return len(cloud) > 0 and bool(np.abs(_middle(cloud)[:2]).max() >= MAP_SIZE_M)
 
 
 def _overlap_in_plan(one: Cloud, other: Cloud) -> bool:
     """Say whether the plans of two clouds meet, by their file coordinates as they stand."""
-    boxes = []
-    for cloud in (one, other):
-        corners = np.column_stack([np.quantile(axis, [0.02, 0.98]) for axis in cloud.xyz.T])
-        boxes.append((corners + cloud.frame.origin)[:, :2])
-    (low, high), (low_other, high_other) = boxes
-    return bool(((low <= high_other) & (low_other <= high)).all())
+    return do_meet(plan_box(one), plan_box(other))
+
+
+def plan_box(cloud: Cloud) -> Values:
+    """Return the low and high plan corner (2, 2) without the outermost points, metres."""
+    box: Values = np.column_stack([np.quantile(axis, [0.02, 0.98]) for axis in cloud.xyz.T])
+    return (box + cloud.frame.origin)[:, :2]
+
+
+def do_meet(one: Values, other: Values) -> bool:
+    """Say whether two boxes of a low and a high corner (2, k) have a place in common."""
+    return bool(((one[0] <= other[1]) & (other[0] <= one[1])).all())
 
 
 def _said_of(

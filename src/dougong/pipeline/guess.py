@@ -7,7 +7,8 @@ from pathlib import Path
 
 from dougong.errors import DougongError, InputError
 from dougong.formats import SUFFIXES, FileInfo, describe, iterate
-from dougong.pipeline.project import is_text, stem
+from dougong.formats.stream import stem_of
+from dougong.pipeline.project import is_text
 from dougong.typing import Kind
 
 _COLOURS = {"red", "green", "blue"}
@@ -123,7 +124,7 @@ def find_clouds(folder: Path) -> tuple[list[Guess], list[str]]:
             # The sentence names the file, not the folder that it is in.
             skipped.append(f"{inside}: {str(error).removeprefix(f'{file.name}: ')}")
             continue
-        name = _free_name(stem(file).replace("\\", "-"), (guess.name for guess in guesses))
+        name = _free_name(stem_of(file).replace("\\", "-"), (guess.name for guess in guesses))
         guesses.append(
             Guess(
                 name=name,

@@ -6,7 +6,7 @@ Whoever works on it takes it in pieces; what is held is one piece.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -59,14 +59,3 @@ def batches(pieces: Iterable[Cloud], most: int) -> Iterator[list[Cloud]]:
         held += len(piece)
     if batch:
         yield batch
-
-
-def together(batch: list[Cloud]) -> Cloud:
-    """Return clouds of one frame and layout, at least one, as one."""
-    if len(batch) == 1:
-        return batch[0]
-    return replace(
-        batch[0],
-        xyz=np.concatenate([piece.xyz for piece in batch]),
-        records=np.concatenate([piece.records for piece in batch]),
-    )

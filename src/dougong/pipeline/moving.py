@@ -19,14 +19,13 @@ from dougong.formats import (
     units_of,
     write,
 )
-from dougong.formats.stream import opened
+from dougong.formats.stream import opened, stem_of
 from dougong.formats.units import METRES
 from dougong.pipeline.memory import refuse_too_large
-from dougong.pipeline.outputs import refuse_output, watched
+from dougong.pipeline.outputs import finite, refuse_output, watched
 from dougong.pipeline.progress import Progress
-from dougong.pipeline.project import stem
 from dougong.pipeline.provenance import Stamp, require_unchanged, sha256, stamp_of
-from dougong.pipeline.registrations import Known, Unit, finite, read_registration
+from dougong.pipeline.registrations import Known, Unit, read_registration
 
 
 def transform_file(
@@ -69,7 +68,7 @@ def transform_file(
             f"the registration is {known.status}; its best pose is applied: {known.reason}"
         )
     scans = scans_in(input)[0]
-    if scans > 1 and known.source != stem(input):
+    if scans > 1 and known.source != stem_of(input):
         notes.append(
             f"{input.name} holds {scans} scans, and the registration is that of {known.source}: "
             "all of them are moved by it, which is right only if they lie in one frame"

@@ -1,15 +1,19 @@
 """Results appear whole or not at all: files and folders are made beside and then renamed."""
 
 import json
+import math
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dougong.errors import InputError, OutputError
-from dougong.formats import WRITABLE
+from dougong.formats.atomic import refuse_bad_target
+from dougong.formats.registry import family_of
 from dougong.formats.unfinished import (
     clear_left,
     clear_parts,
@@ -57,19 +61,13 @@ def refuse_output(input: Path, output: Path, files: Sequence[Path], overwrite: b
     OutputError
         The folder may not be written.
     """
-    if output.exists() and input.exists() and output.samefile(input):
-        msg = f"{output} is the input itself; inputs are never overwritten. Name another output."
-        raise InputError(msg)
-    if output.is_dir():
-        msg = f"{output} is a folder. Name a file in it."
-        raise InputError(msg)
+    try:
+        refuse_bad_target(output, overwrite=True, source=input)
+        family_of(output)
+    except OutputError as error:
+        # The same to the writers, but here it is a word of the command that is wrong.
+        raise InputError(str(error)) from error
     refuse_existing(files, overwrite)
-    if not output.name.lower().endswith(WRITABLE):
-        msg = f"{output.name} cannot be written: clouds are written as {', '.join(WRITABLE)}."
-        raise InputError(msg)
-    if not output.parent.is_dir():
-        msg = f"{output.parent} is not a folder, so {output.name} cannot be written. Make it first."
-        raise InputError(msg)
     if not os.access(output.parent, os.W_OK):
         msg = f"{output.parent} may not be written by this user. Change its permissions."
         raise OutputError(msg)
@@ -158,6 +156,23 @@ def write_text(path: Path, text: str) -> None:
             "Free some space, or write elsewhere."
         )
         raise OutputError(msg) from error
+
+
+def finite(value: Any) -> Any:
+    """Return `value` as JSON can hold it: arrays as lists, NaN and infinity as null."""
+    if isinstance(value, np.ndarray):
+        return finite(value.tolist())
+    if isinstance(value, np.generic):
+        return finite(value.item())
+    if isinstance(value, Mapping):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Path):
+        return str(value)
+    return value
 
 
 def write_json(path: Path, document: Any) -> None:

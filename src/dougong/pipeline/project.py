@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 from dougong.errors import InputError
 from dougong.formats import SUFFIXES, scans_in
 from dougong.formats.registry import kind_of
+from dougong.formats.stream import stem_of
 from dougong.formats.units import as_wkt
 from dougong.params import Parameters
 from dougong.pipeline.merging import Merge
@@ -330,16 +331,17 @@ def from_files(lidar: Sequence[Path], photogrammetry: Sequence[Path]) -> Project
         if not is_text(path):
             raise InputError(f"the name of {path} is no UTF-8 text. Rename it.")
         _refuse_twice(path, known)
-        before = names.setdefault(stem(path), path)
+        before = names.setdefault(stem_of(path), path)
         if before is path:
             continue
         msg = (
-            f"{before} and {path} would both be the cloud {stem(path)!r}: a cloud is called as its "
-            "file is. Rename one, or write a project file (`dougong init DIR`)."
+            f"{before} and {path} would both be the cloud {stem_of(path)!r}: a cloud is called as "
+            "its file is. Rename one, or write a project file (`dougong init DIR`)."
         )
         raise InputError(msg)
     clouds = [
-        {"name": stem(path), "kind": kind, "files": [str(path.resolve())]} for kind, path in kinds
+        {"name": stem_of(path), "kind": kind, "files": [str(path.resolve())]}
+        for kind, path in kinds
     ]
     return validated(Project, {"cloud": clouds}, "the clouds named on the command line")
 
@@ -348,8 +350,3 @@ def is_text(path: Path) -> bool:
     """Say whether a path is UTF-8, which a project file and every result is."""
     # Python keeps bytes that it cannot decode as these.
     return not any("\udc80" <= letter <= "\udcff" for letter in str(path))
-
-
-def stem(path: Path) -> str:
-    """Return a cloud's name: the file's stem, ``.copc`` taken off too."""
-    return path.stem.removesuffix(".copc")

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dougong.cloud import Cloud, Pieces
+from dougong.cloud import Cloud, Pieces, joined, joined_pieces
 from dougong.filters.occupied import DEEPEST, deepest_leaf_m
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid, root_cube_of
-from dougong.pipeline.kept import batches, together
+from dougong.pipeline.kept import batches
 
 MOST_POINTS = 3_000_000
 """Of one cloud: five times what a registration thins it to."""
@@ -48,15 +48,15 @@ def reduced(pieces: Pieces, points: int, most: int) -> Reduced:
     Memory: `most` points and a few pieces.
     """
     if points <= most:
-        return Reduced(cloud=together(list(pieces())), points_in=points, edge_m=None)
-    blocks = lambda: (together(batch).xyz for batch in batches(pieces(), _BATCH))  # noqa: E731
+        return Reduced(cloud=joined_pieces(pieces), points_in=points, edge_m=None)
+    blocks = lambda: (joined(batch).xyz for batch in batches(pieces(), _BATCH))  # noqa: E731
     root = root_cube_of(blocks, points, OctreeVoxelGrid(depth=DEEPEST))
     leaf_m = deepest_leaf_m(blocks, root, most)
     params = OctreeVoxelGrid(voxel_m=leaf_m)
     root = root._replace(voxel_m=leaf_m)
     chosen: list[Cloud] = []
     for batch in batches(pieces(), _BATCH):
-        both = together([*chosen, *batch])
+        both = joined([*chosen, *batch])
         kept = octree_voxel_grid(both.xyz, params, records=both.records, root=root).is_kept
         chosen = [both.select(kept)]
     return Reduced(cloud=chosen[0], points_in=points, edge_m=leaf_m)

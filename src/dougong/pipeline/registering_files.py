@@ -14,6 +14,7 @@ from dougong.formats import (
     read,
 )
 from dougong.formats.faults import NO_SYSTEM
+from dougong.formats.stream import stem_of
 from dougong.pipeline.control import read_control, require_control_of
 from dougong.pipeline.distances import Measured, distances_document, measure, write_distances
 from dougong.pipeline.exports import Ends, write_registration
@@ -21,7 +22,6 @@ from dougong.pipeline.guess import guess_kind_of
 from dougong.pipeline.memory import refuse_too_large
 from dougong.pipeline.pairs import read_pairs
 from dougong.pipeline.progress import Progress
-from dougong.pipeline.project import stem
 from dougong.pipeline.provenance import (
     identified,
     peak_memory_bytes,
@@ -64,10 +64,10 @@ def register_files(
         The clouds cannot be read or combined.
     """
     params = validated(Register, options, "register")
-    picked = None if pairs is None else read_pairs(pairs, stem(source))
+    picked = None if pairs is None else read_pairs(pairs, stem_of(source))
     surveyed = None
     if control is not None:
-        surveyed = require_control_of(read_control(control), control, stem(source))
+        surveyed = require_control_of(read_control(control), control, stem_of(source))
     refuse_too_large([source, target], memory_bytes)
     one = _read(source, source_kind, crs[0], progress)
     two = _read(target, target_kind, crs[1], progress)
@@ -126,7 +126,7 @@ def _read(path: Path, kind: Kind | None, system: str | None, progress: Progress)
     require_unchanged(path, stamp)
     noticed = [f"{path.name}: {note}" for note in (*cloud.notes, *faults_of(cloud))]
     return _Input(
-        cloud=replace(cloud, name=stem(path)),
+        cloud=replace(cloud, name=stem_of(path)),
         kind=kind,
         record={"path": str(path), "sha256": digest, "points": len(cloud)},
         notes=(*guessed, *noticed),

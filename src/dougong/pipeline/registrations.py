@@ -14,29 +14,13 @@ from dougong.cloud import Frame
 from dougong.errors import InputError, RegistrationError
 from dougong.formats.units import METRES, as_wkt, units_of
 from dougong.pipeline.exports import inverse
+from dougong.pipeline.outputs import finite
 from dougong.registration.document import registration_to_json
 from dougong.registration.result import Registration
 from dougong.typing import Transform
 
 Unit = tuple[float, float, float]
 _SAME_PLACE_M = 0.001
-
-
-def finite(value: Any) -> Any:
-    """Return `value` as JSON can hold it: arrays as lists, NaN and infinity as null."""
-    if isinstance(value, np.ndarray):
-        return finite(value.tolist())
-    if isinstance(value, np.generic):
-        return finite(value.item())
-    if isinstance(value, Mapping):
-        return {str(key): finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Path):
-        return str(value)
-    return value
 
 
 def to_document(

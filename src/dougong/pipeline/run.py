@@ -19,12 +19,11 @@ from dougong.pipeline.loading import Loader
 from dougong.pipeline.memory import Room
 from dougong.pipeline.movers import Mover, ReducedClouds
 from dougong.pipeline.network import Frames, register_all
-from dougong.pipeline.outputs import scratch_folder, write_json
+from dougong.pipeline.outputs import finite, scratch_folder, write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.project import Project
 from dougong.pipeline.provenance import Clock, peak_memory_bytes, software
 from dougong.pipeline.refusals import refuse_full_disk_after_filters
-from dougong.pipeline.registrations import finite
 from dougong.pipeline.result_hash import result_hash
 from dougong.pipeline.run_document import (
     DISTANCES,

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from dougong.cloud import Cloud
+from dougong.cloud import Cloud, joined
 from dougong.pipeline.books import Books
-from dougong.pipeline.kept import Kept, together
+from dougong.pipeline.kept import Kept
 from dougong.pipeline.removed import removed_sample, shortened
 from dougong.pipeline.steps import Filtered
 from dougong.threads import ahead
@@ -34,6 +34,6 @@ def spooled(
     for chunk, part in books.along(ahead(chunks)):
         file.append(kept(part))
         more = removed_sample(chunk, part.codes, details=part.details)
-        removed = more if removed is None else shortened(together([removed, more]))
+        removed = more if removed is None else shortened(joined([removed, more]))
     assert removed is not None
     return Kept.on_disk(file), removed

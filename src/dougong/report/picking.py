@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from dougong.errors import InputError
+from dougong.formats.stream import stem_of
 from dougong.pipeline.pairs import HEADER, PickedSet, read_pairs, write_pairs
-from dougong.pipeline.project import stem
 from dougong.pipeline.settings import validated
 from dougong.report.server import Take
 
@@ -28,7 +28,7 @@ def picking(
     InputError
         The file holds something else, or its folder is missing.
     """
-    cloud = stem(source)
+    cloud = stem_of(source)
     known = None
     if file is not None and file.exists():
         known = read_pairs(file, cloud)

@@ -15,8 +15,8 @@ from dougong.formats.faults import (
     copies_in,
     faults_in_words,
     points_beyond,
-    robust_box,
     sample_step,
+    wide_box,
 )
 from dougong.tiles.cloud import POINTS, Arrays, Tile, TiledCloud, name_of, tile_of, write_arrays
 from dougong.tiles.folder import Folder
@@ -92,7 +92,7 @@ def _sample_and_far(spool: Spool) -> tuple[Points, int]:
         parts.append(xyz[-start % step :: step].copy())
         start += len(xyz)
     sample = np.concatenate(parts)
-    box = robust_box(sample)
+    box = wide_box(sample)
     return sample, sum(points_beyond(xyz, *box) for xyz in spool.coordinates())
 
 

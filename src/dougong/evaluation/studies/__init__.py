@@ -20,10 +20,9 @@ import dougong
 from dougong.errors import InputError, OutputError
 from dougong.evaluation.machine import code_hash, machine
 from dougong.evaluation.tabulate import new_figure
-from dougong.pipeline.outputs import refuse_existing, watched, write_json, write_text
+from dougong.pipeline.outputs import finite, refuse_existing, watched, write_json, write_text
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import software
-from dougong.pipeline.registrations import finite
 
 STUDIES: Mapping[str, str] = {
     "denoise": "noise filters: noise removed against carving kept",

@@ -16,7 +16,7 @@ import numpy as np
 
 from dougong.evaluation.apart import apart
 from dougong.evaluation.building_runs import DRONE_SHARE
-from dougong.evaluation.hard_trials import Trial, base_of, moved, plain
+from dougong.evaluation.hard_trials import Trial, base_of, plain
 from dougong.evaluation.machine import memory_beyond, version_of
 from dougong.evaluation.metrics import Truth, pose_errors
 from dougong.evaluation.registration_peers import PEERS, Peer
@@ -25,6 +25,7 @@ from dougong.evaluation.studies import Findings, Setting, measured
 from dougong.evaluation.survey import rotation
 from dougong.evaluation.tabulate import as_text, chosen, distinct, new_figure, spread
 from dougong.pipeline.progress import Progress
+from dougong.registration.overlap import apply
 from dougong.threads import get_threads, set_threads
 from dougong.typing import Transform
 
@@ -128,7 +129,7 @@ def surveyed(kind: str, seed: int, points: int) -> Trial:
 def start_of(truth: Truth, seed: int) -> Transform:
     """Return the true pose turned by 5 degrees about its place and moved by 0.5 m."""
     rng = np.random.default_rng([seed, 5])
-    middle = moved(truth.T_best, truth.surface_points).mean(axis=0)
+    middle = apply(truth.T_best, truth.surface_points).mean(axis=0)
     way = rng.normal(size=3)
     turn = rotation((0.0, 0.0, np.radians(START_DEG) * rng.choice([-1.0, 1.0])))
     step = np.eye(4)
