@@ -12,6 +12,8 @@ from dougong.cli._shell import DONE, FAILED, UNSURE, Answer, Listener, execute
 
 _EXIT = {"ok": DONE, "ambiguous": UNSURE, "failed": FAILED}
 _Sensor = Literal["lidar", "photogrammetry"]
+_Flag = Annotated[bool, Parameter(negative="", show_default=False)]
+_Share = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1))]
 
 
 def command(
@@ -24,18 +26,16 @@ def command(
     coarse: Literal["auto", "plan", "improved-pca", "pca", "sac-ia", "4pcs", "none"] = "auto",
     fine: Literal["point-to-plane", "point-to-point", "none"] = "point-to-plane",
     dof: Literal["auto", "4", "5", "6", "7"] = "auto",
-    filtered: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    filtered: _Flag = False,
     yaw_hint: float | None = None,
     pairs: Path | None = None,
     control: Path | None = None,
     grid_scale: str = "auto",
-    least_overlap: Annotated[
-        float | None, Parameter(validator=validators.Number(gte=0, lte=1))
-    ] = None,
+    least_overlap: _Share | None = None,
     source_crs: str | None = None,
     target_crs: str | None = None,
-    accept_best: Annotated[bool, Parameter(negative="", show_default=False)] = False,
-    overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    accept_best: _Flag = False,
+    overwrite: _Flag = False,
     common: Common = DEFAULT,
 ) -> int:
     """Find the transform from SOURCE's coordinates to TARGET's.
@@ -115,17 +115,18 @@ def command(
             pairs=pairs,
             control=control,
         )
-        code = _EXIT[document["status"]]
-        if accept_best and code == UNSURE:
-            code = DONE
-        return Answer(document=document, text=_words(document, out), exit_code=code)
+        return _answer(document, out, accept_best=accept_best)
 
     return execute(common, work)
 
 
-def _words(document: dict[str, Any], out: Path) -> str:
-    return _text.join(
+def _answer(document: dict[str, Any], out: Path, *, accept_best: bool) -> Answer:
+    code = _EXIT[document["status"]]
+    if accept_best and code == UNSURE:
+        code = DONE
+    text = _text.join(
         _text.registration(document),
         _text.notes(document["notes"]),
         f"wrote {out / 'registration.json'} and {out / 'report.html'}",
     )
+    return Answer(document=document, text=text, exit_code=code)

@@ -290,6 +290,35 @@ def read_header(file: IO[bytes], path: Path) -> LasHeader:
         Not a LAS file, a version or point format that does not exist, or it ends too early.
     """
     name = path.name
+    raw, vlr_count, points_start = _read_fixed(file, name)
+    header = LasHeader(raw=raw, source=path)
+    if header.point_format not in POINT_FORMATS:
+        msg = f"{name} has point format {header.point_format}; 0 to 10 exist. Export it again."
+        raise FormatError(msg)
+    vlrs = _read_vlrs(file, vlr_count, name, is_extended=False)
+    gap = points_start - file.tell()
+    if gap < 0:
+        msg = f"{name}: its records run {-gap} bytes into its points. Export it again."
+        raise FormatError(msg)
+    padding = _take(file, gap, name, "header")
+    header = replace(header, vlrs=vlrs, padding=padding)
+    _refuse_odd_values(header, name)
+    start, count = header.evlr_place
+    if count:
+        size = file.seek(0, 2)
+        if start > size:
+            msg = (
+                f"{name}: header says {header.count:,} points and records at byte {start:,}, file "
+                f"ends at {size:,}. It is truncated; copy it again."
+            )
+            raise FormatError(msg)
+        file.seek(start)
+        header = replace(header, evlrs=_read_vlrs(file, count, name, is_extended=True))
+    return header
+
+
+def _read_fixed(file: IO[bytes], name: str) -> tuple[bytes, int, int]:
+    """Return the header's own bytes, how many records follow it, and where the points begin."""
     head = file.read(227)
     if head[:4] != b"LASF":
         msg = f"{name} is not a LAS or LAZ file: it starts with {head[:4]!r}, expected b'LASF'."
@@ -308,18 +337,11 @@ def read_header(file: IO[bytes], path: Path) -> LasHeader:
             f"{points_start}; LAS 1.{minor} needs at least {least}. Export it again."
         )
         raise FormatError(msg)
-    raw = head + _take(file, header_size - 227, name, "header")
-    header = LasHeader(raw=raw, source=path)
-    if header.point_format not in POINT_FORMATS:
-        msg = f"{name} has point format {header.point_format}; 0 to 10 exist. Export it again."
-        raise FormatError(msg)
-    vlrs = _read_vlrs(file, vlr_count, name, is_extended=False)
-    gap = points_start - file.tell()
-    if gap < 0:
-        msg = f"{name}: its records run {-gap} bytes into its points. Export it again."
-        raise FormatError(msg)
-    padding = _take(file, gap, name, "header")
-    header = replace(header, vlrs=vlrs, padding=padding)
+    return head + _take(file, header_size - 227, name, "header"), vlr_count, points_start
+
+
+def _refuse_odd_values(header: LasHeader, name: str) -> None:
+    """Refuse records that are too short, and steps or an offset that are no numbers to use."""
     least = np.dtype(POINT_FORMATS[header.point_format]).itemsize
     if header.point_bytes < least:
         msg = (
@@ -333,15 +355,3 @@ def read_header(file: IO[bytes], path: Path) -> LasHeader:
     if not np.isfinite(header.offset).all():
         msg = f"{name} has offset {header.offset.tolist()}; it must be finite. Export it again."
         raise FormatError(msg)
-    start, count = header.evlr_place
-    if count:
-        size = file.seek(0, 2)
-        if start > size:
-            msg = (
-                f"{name}: header says {header.count:,} points and records at byte {start:,}, file "
-                f"ends at {size:,}. It is truncated; copy it again."
-            )
-            raise FormatError(msg)
-        file.seek(start)
-        header = replace(header, evlrs=_read_vlrs(file, count, name, is_extended=True))
-    return header

@@ -118,6 +118,15 @@ def _is_apart(boxes: Floats, node: int, core: Floats, reach: Floats) -> bool:
 
 
 @kernel
+def _reach(normal: Floats, length: float, radius: float, reach: Floats) -> None:
+    """Write the half sides of a cylinder's box into reach (3,)."""
+    for axis in range(3):
+        along = abs(normal[axis])
+        # A hair more than the cylinder's box: rounding must not prune a point on its rim.
+        reach[axis] = 1e-9 + length * along + radius * np.sqrt(max(1.0 - along * along, 0.0))
+
+
+@kernel
 def _summary(ordered: Floats, use_median: bool) -> tuple[float, float]:
     """Return middle and spread: median and IQR / 1.349, or mean and standard deviation."""
     n = ordered.shape[0]
@@ -165,13 +174,11 @@ def project(
     for q in range(start, stop):
         counts[q] = 0
         middles[q] = spreads[q] = np.nan
+        x, y, z = cores[q, 0], cores[q, 1], cores[q, 2]
         nx, ny, nz = normals[q, 0], normals[q, 1], normals[q, 2]
         if not (nx == nx):
             continue
-        for axis in range(3):
-            along = abs(normals[q, axis])
-            # A hair more than the cylinder's box: rounding must not prune a point on its rim.
-            reach[axis] = 1e-9 + length * along + radius * np.sqrt(max(1.0 - along * along, 0.0))
+        _reach(normals[q], length, radius, reach)
         count = 0
         stack[0] = 1
         height = 1
@@ -187,9 +194,7 @@ def project(
                 continue
             leaf = node - leaves
             for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
-                dx = points[i, 0] - cores[q, 0]
-                dy = points[i, 1] - cores[q, 1]
-                dz = points[i, 2] - cores[q, 2]
+                dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
                 along = dx * nx + dy * ny + dz * nz
                 dx -= along * nx
                 dy -= along * ny

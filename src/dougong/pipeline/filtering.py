@@ -153,26 +153,17 @@ def filter_file(
     room = Room.of(memory_bytes)
     with _places(output, work, f"{digest} {job.tiled().grid!r} in {room.bytes:.0f}") as places:
         result: Cloud | Pieces
-        hold: Hold | None = None
-        books: Books
         if is_too_large(input, room, 0):
             progress.note(f"{input.name} is larger than memory: it is filtered on tiles")
             with clock.measure("filter"):
                 books, again = _filtered_on_tiles(input, stamp, job, room, places, progress)
-            hold = Hold(room.held_points(), places.writing)
             result = _pieces(again, job, books, mark)
         else:
-            with clock.measure("read"):
-                cloud = read(input)
-                require_unchanged(input, stamp)
-                noticed = (*cloud.notes, *faults_of(cloud))
-            with clock.measure("filter"):
-                filtered = job.run(cloud, progress)
-            books = Books.of(filtered, noticed)
-            result = _chosen(job, cloud, filtered, mark)
+            books, result = _filtered_whole(input, stamp, job, mark, clock, progress)
         progress.stage(f"writing {output.name}")
         with watched(output, beside):
             with clock.measure("write"):
+                hold = Hold(room.held_points(), places.writing)
                 written = write(result, output, overwrite=overwrite, hold=hold)
             notes = [*books.noticed, *books.notes, *written.notes]
             document = {
@@ -262,6 +253,19 @@ def _filter_document(job: FilterJob, books: Books, written: int, mark: bool) -> 
         "ground_points": tally.ground,
         "parameters": job.params.model_dump(mode="json"),
     }
+
+
+def _filtered_whole(
+    input: Path, stamp: Stamp, job: FilterJob, mark: bool, clock: Clock, progress: Progress
+) -> tuple[Books, Cloud]:
+    """Return what was decided about every point of the file, and what is written of it."""
+    with clock.measure("read"):
+        cloud = read(input)
+        require_unchanged(input, stamp)
+        noticed = (*cloud.notes, *faults_of(cloud))
+    with clock.measure("filter"):
+        filtered = job.run(cloud, progress)
+    return Books.of(filtered, noticed), _chosen(job, cloud, filtered, mark)
 
 
 def _filtered_on_tiles(

@@ -55,24 +55,8 @@ def transform_file(
     refuse_output(input, output, [output], overwrite)
     with opened(input):  # what cannot be is said as every command says it
         stamp = stamp_of(input)
-    crs, unit_m = system_in(input)
-    _require_unit(input, crs, unit_m, known)
-    notes = [*known.notes, *_file_notes(input, known), *_system_notes(input, crs, unit_m, known)]
-    if known.target_crs is not None and is_same_crs(crs, known.target_crs):
-        notes.append(
-            f"{input.name} is in {known.target}'s coordinate system already; check that it is "
-            "not moved twice"
-        )
-    if known.status != "ok":
-        notes.append(
-            f"the registration is {known.status}; its best pose is applied: {known.reason}"
-        )
     scans = scans_in(input)[0]
-    if scans > 1 and known.source != stem_of(input):
-        notes.append(
-            f"{input.name} holds {scans} scans, and the registration is that of {known.source}: "
-            "all of them are moved by it, which is right only if they lie in one frame"
-        )
+    notes = _doubts(input, scans, known)
     frame = Frame(crs=known.target_crs, unit_m=known.target_unit_m)
     with watched(output):
         if can_reissue(input, output):
@@ -115,6 +99,34 @@ def _require_unchanged(input: Path, stamp: Stamp, output: Path) -> None:
     except FormatError:
         output.unlink(missing_ok=True)
         raise
+
+
+def _doubts(input: Path, scans: int, known: Known) -> list[str]:
+    """Return why the file may not be what the matrix is for, in words.
+
+    Raises
+    ------
+    FrameError
+        As `transform_file`.
+    """
+    crs, unit_m = system_in(input)
+    _require_unit(input, crs, unit_m, known)
+    notes = [*known.notes, *_file_notes(input, known), *_system_notes(input, crs, unit_m, known)]
+    if known.target_crs is not None and is_same_crs(crs, known.target_crs):
+        notes.append(
+            f"{input.name} is in {known.target}'s coordinate system already; check that it is "
+            "not moved twice"
+        )
+    if known.status != "ok":
+        notes.append(
+            f"the registration is {known.status}; its best pose is applied: {known.reason}"
+        )
+    if scans > 1 and known.source != stem_of(input):
+        notes.append(
+            f"{input.name} holds {scans} scans, and the registration is that of {known.source}: "
+            "all of them are moved by it, which is right only if they lie in one frame"
+        )
+    return notes
 
 
 def _require_unit(input: Path, crs: str | None, unit_m: Unit | None, known: Known) -> None:

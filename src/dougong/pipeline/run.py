@@ -111,19 +111,8 @@ def _result(project: Project, loader: Loader, out: Path) -> dict[str, Any]:
             write_distances(link.measured, out / DISTANCES / f"{link.mover.name}.laz")
     merged = write_clouds(linked, reference.frame, project.merge, out, progress, clock, hold)
     write_registrations(documents, linked, reference, out, loader.shown)
-    full = None
-    if project.project.full_resolution:
-        with clock.measure("full_resolution"):
-            full = write_full_resolution(
-                _places(linked),
-                reference.frame,
-                out,
-                reference=reference.name,
-                inputs=loader.inputs,
-                require_unchanged=loader.require_unchanged,
-                shown=loader.shown,
-                progress=progress,
-            )
+    asked = project.project.full_resolution
+    full = _written_in_full(linked, reference, loader, out) if asked else None
     with clock.measure("hash"):
         digest = result_hash(linked, reference.frame, hold)
     statuses = [document["status"] for document in documents] or ["ok"]
@@ -169,6 +158,23 @@ def _registered(
     with loader.clock.measure("distances"):
         linked = [measured_link(link, reference, clouds, progress) for link in found.linked]
     return replace(found, linked=linked)
+
+
+def _written_in_full(
+    linked: Sequence[Linked], reference: Mover, loader: Loader, out: Path
+) -> dict[str, Any]:
+    """Write every input file with all its points in the frame of the reference."""
+    with loader.clock.measure("full_resolution"):
+        return write_full_resolution(
+            _places(linked),
+            reference.frame,
+            out,
+            reference=reference.name,
+            inputs=loader.inputs,
+            require_unchanged=loader.require_unchanged,
+            shown=loader.shown,
+            progress=loader.progress,
+        )
 
 
 def _places(linked: Sequence[Linked]) -> list[Place]:

@@ -59,6 +59,19 @@ def write_clouds(
                 )
             )
             painted.append(pieces if paint is None else paint.pieces(pieces))
+    return _write_merged(parts, painted, merge, out, progress, clock, hold)
+
+
+def _write_merged(
+    parts: Sequence[Part],
+    painted: Sequence[Pieces],
+    merge: Merge,
+    out: Path,
+    progress: Progress,
+    clock: Clock,
+    hold: Hold,
+) -> dict[str, Any]:
+    """Write the merged cloud of `parts`, as they are `painted`; return what it holds."""
     progress.stage("choosing what is merged")
     with clock.measure("merge"):
         chosen = choose(parts, merge, hold)

@@ -169,10 +169,30 @@ def prepare(
         _streamable(item, scratch / f"{index}.copc.laz", room, say, notes)
         for index, item in enumerate(items)
     ]
+    origin, placed = _placed(items, files, notes)
+    sources, clouds, looks = _listed(items, files, placed)
+    things = {
+        cloud["url"]: Served(kind="application/octet-stream", body=path.resolve())
+        for cloud, path in zip(clouds, files, strict=True)
+    }
+    scene = _scene(sources, clouds, looks, origin)
+    scene["pairs"] = picked
+    return Scene(
+        things=things | _page(", ".join(item.name for item in items[:3]), scene),
+        clouds=tuple(source["name"] for source in sources),
+        points=sum(cloud["points"] for cloud in clouds),
+        notes=tuple(notes),
+        takes=takes,
+    )
+
+
+def _listed(
+    items: Sequence[Item], files: Sequence[Path], placed: Sequence[Transform]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[Look]]:
+    """Return what the page lists, the files it draws, and how each of these is coloured."""
     sources: list[dict[str, Any]] = []
     clouds: list[dict[str, Any]] = []
     looks: list[Look] = []
-    origin, placed = _placed(items, files, notes)
     for index, (item, path) in enumerate(zip(items, files, strict=True)):
         look = look_at(path)
         looks.append(look)
@@ -194,25 +214,20 @@ def prepare(
                 "to_local": placed[index].ravel().tolist(),
                 "source": first,
                 "source_ids": ids,
-                "grey": look.grey,
-                "colour_bits": look.colour_bits,
-                "residual": look.residual,
-                "code_max_m": REACH_M,
+                **_drawn(look),
             }
         )
-    things = {
-        cloud["url"]: Served(kind="application/octet-stream", body=path.resolve())
-        for cloud, path in zip(clouds, files, strict=True)
+    return sources, clouds, looks
+
+
+def _drawn(look: Look) -> dict[str, Any]:
+    """Return what the page must know of a file to colour it."""
+    return {
+        "grey": look.grey,
+        "colour_bits": look.colour_bits,
+        "residual": look.residual,
+        "code_max_m": REACH_M,
     }
-    scene = _scene(sources, clouds, looks, origin)
-    scene["pairs"] = picked
-    return Scene(
-        things=things | _page(", ".join(item.name for item in items[:3]), scene),
-        clouds=tuple(source["name"] for source in sources),
-        points=sum(cloud["points"] for cloud in clouds),
-        notes=tuple(notes),
-        takes=takes,
-    )
 
 
 def _scene(
