@@ -9,10 +9,12 @@ from dougong.cloud import Cloud
 from dougong.evaluation.copies import COPIES, make_trial
 from dougong.evaluation.metrics import pose_errors
 from dougong.registration import register
-from dougong.registration.evidence import summon
+from dougong.registration.deciding_part import deciding_part
+from dougong.registration.evidence import hear, summon
 from dougong.registration.ground_relief import relief
 from dougong.registration.prepare import prepare
 from dougong.registration.standing_things import Telling, things_of
+from dougong.registration.verdict import Verdict
 
 SPOTS = [
     (-9.0, -7.0),
@@ -108,6 +110,48 @@ def test_what_a_rival_finds_too_repeats_and_is_not_asked():
     assert things.telling(np.eye(4), [turned(180.0)]).found < 3
 
 
+def test_things_on_a_part_that_may_have_moved_are_not_asked():
+    things = things_between(court(SPOTS), court(SPOTS, seed=1))
+    every = things.telling(np.eye(4), [])
+    east = things.telling(np.eye(4), [], lambda points: points[:, 0] < 0.0)
+    assert every.found == 2 * len(SPOTS)
+    assert east.found == 2 * sum(x > 0.0 for x, _ in SPOTS)
+    # The part lies in the target's frame, wherever the source's is.
+    two = court(SPOTS, seed=1)
+    moved = things_between(court(SPOTS), replace(two, xyz=two.xyz + [50.0, 0.0, 0.0]))
+    assert moved.telling(shifted(50.0), [], lambda points: points[:, 0] < 50.0).found == east.found
+
+
+def house_with(*extensions, seed=0):
+    """Points of a house that equals itself turned by 180 degrees, with extensions."""
+    rng = np.random.default_rng(seed)
+    parts = [box(rng, (0.0, 0.0), (14.0, 8.0, 5.0)) for _ in range(3)]
+    parts += [box(rng, at, (3.0, 2.0, 3.0)) for at in extensions]
+    cloud = Cloud.from_points(np.vstack(parts))
+    found = prepare(cloud, "lidar")
+    return replace(found, xyz=found.xyz + cloud.frame.origin)
+
+
+@pytest.mark.parametrize(
+    ("extensions", "size"),
+    [
+        # What is left beside one extension fits turned as well as not; two of them hold the house.
+        ([(2.0, -5.0)], (4.0, 4.0)),
+        ([(2.0, -5.0), (-8.5, 1.0)], None),
+    ],
+)
+def test_the_part_that_decides_alone_is_named(extensions, size):
+    one, two = (house_with(*extensions, seed=seed) for seed in (0, 1))
+    heard = summon(one, two)
+    part = deciding_part(heard, hear(heard, np.eye(4)), hear(heard, turned(180.0)), Verdict())
+    if size is None:
+        assert part is None
+        return
+    assert part is not None
+    assert max(part.size_m) <= max(size) + 4.0
+    assert part.holds(np.array([[*extensions[0], 1.0]])).all()
+
+
 def test_things_that_stayed_speak_for_the_pose_that_finds_them():
     things = things_between(court(SPOTS), court(SPOTS, 1))
     assert things.speak_for(np.eye(4), turned(100.0)) >= 6
@@ -184,6 +228,9 @@ def test_a_place_is_made_again_by_its_seed(kind):
     [
         ("corners", 2, 0, "both scans show one side"),
         ("cloister", 0, 3, "the place repeats"),
+        # Posts of the scaffolding stand about and are found: they moved with it.
+        ("scaffold", 2, 0, "alone tells which way round"),
+        ("scaffold", 40, 0, "alone tells which way round"),
         ("stalls", 2, 2, "found under another one"),
     ],
 )

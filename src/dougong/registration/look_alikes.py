@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dougong.registration.deciding_part import deciding_part
 from dougong.registration.evidence import (
     Court,
     Testimony,
@@ -24,7 +25,7 @@ from dougong.registration.evidence import (
 from dougong.registration.ground_relief import level_ground, relief
 from dougong.registration.prepare import Prepared
 from dougong.registration.rivals import is_near
-from dougong.registration.standing_things import things_of
+from dougong.registration.standing_things import Things, things_of
 from dougong.registration.symmetry import in_short, move_between
 from dougong.registration.verdict import Ruling, Verdict
 from dougong.typing import Mask, Points, Transform
@@ -50,7 +51,8 @@ def look_alike_doubt(
 
     Things that are gone under the winner are found under a rival; more than a few are gone and
     none found that chance would not find; the ground has another relief; or neither things nor
-    relief vouch for the winner, and two scans leave room for a copy that they do not show.
+    relief vouch for the winner, and two scans leave room for a copy that they do not show, or one
+    part of the place alone speaks against a rival.
     """
     spacing = max(witness.everything.spacing_m for witness in (court.source, court.target))
     things = things_of(
@@ -87,11 +89,36 @@ def look_alike_doubt(
             f"the same (correlation {ground.alike:.2f}). Either it was dug up, or the clouds show "
             f"two parts of the place that are alike. {_DECIDES}"
         )
-    if telling.is_vouched or ground.is_vouched:
+    if ground.is_vouched:
         return None
-    is_scanned = source.kind == target.kind == "lidar"
     # A flight shows a building from all sides.
-    return _unseen_copy(court, grounds, ruling, rivals) if is_scanned else None
+    is_scanned = source.kind == target.kind == "lidar"
+    if is_scanned and not telling.is_vouched:
+        unseen = _unseen_copy(court, grounds, ruling, rivals)
+        if unseen is not None:
+            return unseen
+    return _rests_on_one_part(court, ruling, rivals, things, params)
+
+
+def _rests_on_one_part(
+    court: Court, ruling: Ruling, rivals: Sequence[Transform], things: Things, params: Verdict
+) -> str | None:
+    """Return where one part of the place alone tells the winner from a rival, and may have moved.
+
+    Things on that part may have moved with it; others may vouch.
+    """
+    winner = ruling.winner
+    for rival in rivals:
+        part = deciding_part(court, winner, hear(court, rival), params)
+        if part is None or things.telling(winner.T, rivals, part.holds).is_vouched:
+            continue
+        long, short = part.size_m
+        return (
+            f"the place repeats ({_moved(rival, ruling)}), and one part of it, {long:.0f} x "
+            f"{short:.0f} m, alone tells which way round: if that is something that was moved "
+            f"between the surveys, as scaffolding is, the pose is wrong. {_DECIDES}"
+        )
+    return None
 
 
 def _unseen_copy(

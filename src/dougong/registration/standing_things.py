@@ -11,7 +11,7 @@ not asked.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -106,6 +106,13 @@ class _Side:
         """Return how many things there are."""
         return len(self.may_go)
 
+    def middles(self) -> Points:
+        """Return the middle (count, 3) of each thing."""
+        held = np.maximum(np.bincount(self.thing, minlength=self.count), 1)
+        sums = [np.bincount(self.thing, axis, self.count) for axis in self.points.T]
+        middles: Points = np.column_stack(sums) / held[:, None]
+        return middles
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Telling:
@@ -166,14 +173,23 @@ class Things:
                 tries += int((asked & (fate.is_found | fate.is_gone)).sum())
         return float(found / tries)
 
-    def telling(self, T: Transform, rivals: Sequence[Transform]) -> Telling:
+    def telling(
+        self,
+        T: Transform,
+        rivals: Sequence[Transform],
+        unasked: Callable[[Points], Mask] | None = None,
+    ) -> Telling:
         """Return how many things are found and gone under a pose, without what proves nothing.
 
         `rivals`: poses of other places; what is found there too is not counted. Nor is gone what
-        may have walked or driven away.
+        may have walked or driven away. Of things that stand where `unasked` says so, points (n, 3)
+        in the target's frame, nothing is counted.
         """
         fate = self.fates(T)
         is_asked = np.ones(len(fate.is_found), bool)
+        if unasked is not None:
+            sides = (self.source, T), (self.target, np.eye(4))
+            is_asked &= ~np.concatenate([unasked(apply(M, side.middles())) for side, M in sides])
         for rival in rivals:
             is_asked &= ~self.fates(rival).is_found
         may_go = np.concatenate([self.source.may_go, self.target.may_go])
