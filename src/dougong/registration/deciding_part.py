@@ -22,6 +22,8 @@ from dougong.typing import Mask, Points
 _CELL_M = 2.0
 _LOUD = 0.02
 """Cells that speak for the winner by this share of the loudest belong to a part."""
+_MOST_M2 = 300.0
+"""No scaffolding or market covers more: a part that does is the place itself."""
 _REST = 0.25
 """A rival that explains less than this share of what the winner does, outside the part, is no pose
 of the whole place: the part is the place."""
@@ -45,6 +47,11 @@ class DecidingPart:
         return held
 
     @property
+    def area_m2(self) -> float:
+        """Return how much of the plan it covers."""
+        return _CELL_M**2 * float(self.held.sum())
+
+    @property
     def size_m(self) -> tuple[float, float]:
         """Return its longer and its shorter side along the axes, metres."""
         sides = sorted(_CELL_M * (1.0 + float(np.ptp(axis))) for axis in np.nonzero(self.held))
@@ -56,15 +63,15 @@ def deciding_part(
 ) -> DecidingPart | None:
     """Return the part without which a beaten rival is as good as the winner; None: there is none.
 
-    The largest region in plan that speaks for the winner, in cells of 2 m. None too where little
-    is left beside it.
+    The largest region in plan that speaks for the winner, in cells of 2 m. None too where it is
+    larger than what can be moved, or little is left beside it.
     """
     places = np.concatenate([apply(winner.T, court.source.points), court.target.points])
     part = _loudest(places, court.weights * (rival.loss - winner.loss))
     is_rest = ~part.holds(places)
     structure = structure_weights(court)
     left = float(structure @ (rival.is_explained & is_rest))
-    if left < _REST * float(structure @ winner.is_explained):
+    if left < _REST * float(structure @ winner.is_explained) or part.area_m2 > _MOST_M2:
         return None
     rest = compare(court, winner, rival, params.block_m, is_rest)
     return None if is_beaten(rest, params, is_close=True) else part
