@@ -82,9 +82,9 @@ def test_things_are_found_where_they_stand_and_gone_elsewhere():
     assert not here.is_gone.any()
     assert beside.is_gone.sum() >= 10
     assert beside.is_found.sum() <= 2
-    assert things.telling(np.eye(4), []).is_vouched
-    assert not things.telling(np.eye(4), []).is_refuted
-    assert things.telling(turned(100.0), []).is_refuted
+    assert things.telling(np.eye(4)).is_vouched
+    assert not things.telling(np.eye(4)).is_refuted
+    assert things.telling(turned(100.0)).is_refuted
 
 
 def test_a_place_without_ground_says_nothing_of_a_thing():
@@ -99,27 +99,32 @@ def test_who_walked_away_is_no_witness():
     people = [(0.4, 0.6, 1.7)]
     things = things_between(court(SPOTS, sizes=people), court([]))
     assert things.fates(np.eye(4)).is_gone.sum() == len(SPOTS)
-    assert things.telling(np.eye(4), []).gone == 0
+    assert things.telling(np.eye(4)).gone == 0
 
 
 def test_what_a_rival_finds_too_repeats_and_is_not_asked():
     spots = [(x, y) for a, b in SPOTS[:4] for x, y in ((a, b), (-a, -b))]
     sizes = [size for size in SIZES for _ in range(2)]
     things = things_between(court(spots, sizes=sizes), court(spots, 1, sizes=sizes))
-    assert things.telling(np.eye(4), []).found == 16
-    assert things.telling(np.eye(4), [turned(180.0)]).found < 3
+    assert things.telling(np.eye(4)).found == 16
+    assert things.telling(np.eye(4), things.found_by([turned(180.0)])).found < 3
 
 
 def test_things_on_a_part_that_may_have_moved_are_not_asked():
     things = things_between(court(SPOTS), court(SPOTS, seed=1))
-    every = things.telling(np.eye(4), [])
-    east = things.telling(np.eye(4), [], lambda points: points[:, 0] < 0.0)
+
+    def west_of(x):
+        return lambda points: points[:, 0] < x
+
+    every = things.telling(np.eye(4))
+    east = things.telling(np.eye(4), things.standing_on(west_of(0.0), np.eye(4)))
     assert every.found == 2 * len(SPOTS)
     assert east.found == 2 * sum(x > 0.0 for x, _ in SPOTS)
     # The part lies in the target's frame, wherever the source's is.
     two = court(SPOTS, seed=1)
     moved = things_between(court(SPOTS), replace(two, xyz=two.xyz + [50.0, 0.0, 0.0]))
-    assert moved.telling(shifted(50.0), [], lambda points: points[:, 0] < 50.0).found == east.found
+    unasked = moved.standing_on(west_of(50.0), shifted(50.0))
+    assert moved.telling(shifted(50.0), unasked).found == east.found
 
 
 def house_with(*extensions, seed=0):

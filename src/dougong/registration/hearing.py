@@ -17,7 +17,7 @@ from dougong.registration.prepare import Prepared
 from dougong.registration.result import FineResult, Status
 from dougong.registration.rivals import is_same, middle_of
 from dougong.registration.settings import Register
-from dougong.registration.told_by_ground import told_by_ground
+from dougong.registration.told_apart import told_apart
 from dougong.registration.verdict import Ruling, rule, status_of
 from dougong.typing import Transform
 
@@ -79,7 +79,7 @@ def hear_pair(
         params.verdict,
         lambda T: is_near_hint(T, params) and (control is None or control.allows(T)),
     )
-    ruling = told_by_ground(court, clouds, levels, ruling, quick, params.verdict)
+    ruling = told_apart(court, clouds, levels, ruling, quick, params.verdict)
     clock.lap("proof")
     fine, adjusted = _refined(*clouds, ruling, params, control)
     clock.lap("fine")

@@ -70,7 +70,7 @@ def look_alike_doubt(
                 f"it and found under another one ({_moved(rival, ruling)}): one of the two rests "
                 "on what was moved between the surveys. A yaw hint or control points would decide."
             )
-    telling = things.telling(winner, rivals)
+    telling = things.telling(winner, things.found_by(rivals))
     if telling.is_refuted:
         return (
             f"what stands about speaks against the best pose: {telling.gone} things are gone where "
@@ -110,7 +110,10 @@ def _rests_on_one_part(
     winner = ruling.winner
     for rival in rivals:
         part = deciding_part(court, winner, hear(court, rival), params)
-        if part is None or things.telling(winner.T, rivals, part.holds).is_vouched:
+        if part is None:
+            continue
+        unasked = things.found_by(rivals) | things.standing_on(part.holds, winner.T)
+        if things.telling(winner.T, unasked).is_vouched:
             continue
         long, short = part.size_m
         return (

@@ -17,6 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from scipy.stats import binom
 
 from dougong.filters.clusters import clusters_of, members
@@ -55,6 +58,8 @@ _MANY = 3
 """Fewer things gone say nothing."""
 _BY_CHANCE = 0.05
 _BEYOND_CHANCE = 0.005
+_TOGETHER_M = 4.0
+"""Things no farther apart than this may have been moved together."""
 _PERSON_M = ((0.9, 2.2), 1.1)
 """Top above the ground, longest side in plan of what may have walked away ..."""
 _VEHICLE_M = ((1.1, 2.8), (2.6, 6.0), (1.2, 2.6))
@@ -161,7 +166,20 @@ class Things:
         found, gone = zip(one, two, strict=True)
         return Fates(is_found=np.concatenate(found), is_gone=np.concatenate(gone))
 
-    def chance(self, T: Transform, asked: Mask) -> float:
+    def groups(self, T: Transform) -> Index:
+        """Return which things (count,) stand within 4 m of each other, in a chain, under a pose."""
+        places = self._middles(T)[:, :2]
+        pairs = cKDTree(places).query_pairs(_TOGETHER_M, output_type="ndarray")
+        shape = len(places), len(places)
+        graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=shape)
+        group: Index = connected_components(graph, directed=False)[1].astype(np.int64)
+        return group
+
+    def _middles(self, T: Transform) -> Points:
+        """Return the middle (count, 3) of every thing under a pose, in the target's frame."""
+        return np.vstack([apply(T, self.source.middles()), self.target.middles()])
+
+    def chance(self, T: Transform, asked: Mask, group: Index | None = None) -> float:
         """Return which share of the `asked` things is found by chance, metres beside a pose."""
         found, tries = _PRIOR
         for reach in _BESIDE_M:
@@ -169,35 +187,42 @@ class Things:
                 beside = T.copy()
                 beside[:2, 3] += reach * np.array([np.cos(turn), np.sin(turn)])
                 fate = self.fates(beside)
-                found += int((asked & fate.is_found).sum())
-                tries += int((asked & (fate.is_found | fate.is_gone)).sum())
+                back, gone = _counted(fate.is_found & asked, fate.is_gone & asked, group)
+                found, tries = found + back, tries + back + gone
         return float(found / tries)
 
-    def telling(
-        self,
-        T: Transform,
-        rivals: Sequence[Transform],
-        unasked: Callable[[Points], Mask] | None = None,
-    ) -> Telling:
-        """Return how many things are found and gone under a pose, without what proves nothing.
+    def found_by(self, poses: Sequence[Transform]) -> Mask:
+        """Say which things (count,) are found under any of some poses."""
+        found: Mask = np.zeros(self.source.count + self.target.count, bool)
+        for T in poses:
+            found |= self.fates(T).is_found
+        return found
 
-        `rivals`: poses of other places; what is found there too is not counted. Nor is gone what
-        may have walked or driven away. Of things that stand where `unasked` says so, points (n, 3)
-        in the target's frame, nothing is counted.
+    def standing_on(self, is_on: Callable[[Points], Mask], T: Transform) -> Mask:
+        """Say which things (count,) stand where `is_on` says so of points in the target's frame."""
+        return is_on(self._middles(T))
+
+    def telling(
+        self, T: Transform, unasked: Mask | None = None, group: Index | None = None
+    ) -> Telling:
+        """Return how many things are found and gone under a pose.
+
+        Not counted as gone is what may have walked or driven away.
+
+        Parameters
+        ----------
+        T : ndarray, shape (4, 4)
+            Source -> target.
+        unasked : ndarray of bool, shape (count,), optional
+            Things that prove nothing, such as what a rival finds as well.
+        group : ndarray of int, shape (count,), optional
+            Things of one group count once, found if one of them is; see `groups`.
         """
         fate = self.fates(T)
-        is_asked = np.ones(len(fate.is_found), bool)
-        if unasked is not None:
-            sides = (self.source, T), (self.target, np.eye(4))
-            is_asked &= ~np.concatenate([unasked(apply(M, side.middles())) for side, M in sides])
-        for rival in rivals:
-            is_asked &= ~self.fates(rival).is_found
+        is_asked = np.ones(len(fate.is_found), bool) if unasked is None else ~unasked
         may_go = np.concatenate([self.source.may_go, self.target.may_go])
-        return Telling(
-            found=int((fate.is_found & is_asked).sum()),
-            gone=int((fate.is_gone & is_asked & ~may_go).sum()),
-            chance=self.chance(T, is_asked),
-        )
+        found, gone = _counted(fate.is_found & is_asked, fate.is_gone & is_asked & ~may_go, group)
+        return Telling(found=found, gone=gone, chance=self.chance(T, is_asked, group))
 
     def speak_for(self, rival: Transform, winner: Transform) -> int:
         """Return how many things gone under the winner are found under a rival; 0: by chance."""
@@ -207,6 +232,14 @@ class Things:
             return 0
         chance = self.chance(rival, first.is_gone)
         return back if binom.sf(back - 1, gone, chance) <= _BEYOND_CHANCE else 0
+
+
+def _counted(is_found: Mask, is_gone: Mask, group: Index | None) -> tuple[int, int]:
+    """Return how many things, or groups of them, are found, and how many are only gone."""
+    if group is None:
+        return int(is_found.sum()), int(is_gone.sum())
+    found = set(group[is_found].tolist())
+    return len(found), len(set(group[is_gone].tolist()) - found)
 
 
 def things_of(

@@ -119,7 +119,7 @@ class Ruling:
     """How the winner compares with a pose that is not allowed (by a hint, by control points) and
     that the clouds prefer beyond doubt; None: there is none."""
     told: str = ""
-    """What told the winner from poses that fit as well; see `told_by_ground`."""
+    """What told the winner from poses that fit as well; see `told_apart`."""
 
 
 def compare(
