@@ -1,6 +1,7 @@
 """Clouds: selecting, packed attributes, moving between frames."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -168,6 +169,15 @@ def test_rebased_points_are_in_the_same_place():
     cloud = Cloud.from_points(np.array([[1.5, 2.5, 3.5]]))
     other = cloud.rebased(np.array([10.0, 20.0, 30.0]))
     assert np.array_equal(other.frame.to_file(other.xyz), cloud.frame.to_file(cloud.xyz))
+
+
+@pytest.mark.parametrize("factors", [3.0, np.array([-1.0, 1.0, 2.0])])
+def test_the_scanner_stays_where_it_stood_in_a_stretched_cloud(factors):
+    """Its place was left behind: free space was cast from elsewhere."""
+    cloud = replace(Cloud.from_points(np.eye(3)), viewpoints=np.array([[8.0, 6.0, 2.6]]))
+    other = cloud.stretched(factors, cloud.frame)
+    assert np.array_equal(other.xyz, cloud.xyz * factors)
+    assert np.array_equal(other.viewpoints, np.array([[8.0, 6.0, 2.6]]) * factors)
 
 
 def test_a_mirror_is_refused():

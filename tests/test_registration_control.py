@@ -103,6 +103,20 @@ def test_exact_points_give_the_exact_pose_whatever_the_coordinates():
     np.testing.assert_allclose(moved, PLACES + MAP, atol=1e-8)
 
 
+def test_the_power_of_the_test_for_bad_points_is_that_of_its_chance():
+    """Three coordinates were held against the quantile of one: 6 sigma passed in half the cases."""
+    T, sigma, draws = motion(), 0.003, 60
+    alarms = sum(
+        not local(points(T, sigma, checks=0, seed=seed), T)[0].used.all() for seed in range(draws)
+    )
+    assert alarms <= 3  # 7 points, 1 in 1000 each
+    named = 0
+    for seed in range(draws):
+        bad = spoilt(points(T, sigma, checks=0, seed=seed), "P2", [0.0, 0.0, 8.0 * sigma])
+        named += not local(bad, T)[0].used[2]
+    assert named >= 0.95 * draws
+
+
 @pytest.mark.parametrize("name", ["P0", "P3"])
 def test_a_bad_point_is_found_and_left_out(name):
     T = motion()

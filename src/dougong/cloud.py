@@ -338,6 +338,20 @@ class Cloud:
             viewpoints=seen_from,
         )
 
+    def stretched(self, factors: float | NDArray[np.float64], frame: Frame) -> Cloud:
+        """Return the cloud with its local coordinates multiplied, in a `frame` that says so.
+
+        No motion: what the file's numbers mean is another, or an axis runs the other way.
+
+        Parameters
+        ----------
+        factors : float or ndarray, shape (3,)
+        frame : Frame
+            Of the result.
+        """
+        seen_from = None if self.viewpoints is None else self.viewpoints * factors
+        return replace(self, xyz=self.xyz * factors, frame=frame, viewpoints=seen_from)
+
     def rebased(self, origin: NDArray[np.float64]) -> Cloud:
         """Return the same points in local coordinates about another `origin` (3,), metres."""
         shift = self.frame.origin - origin

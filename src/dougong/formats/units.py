@@ -300,7 +300,7 @@ def in_system(cloud: Cloud, crs: str | None) -> Cloud:
     ratio = np.asarray(units.unit_m) / np.asarray(frame.unit_m)
     placed = replace(frame, origin=frame.origin * ratio, crs=wkt, unit_m=units.unit_m)
     # Not a motion: the file's numbers stay, only what they mean is known now.
-    return replace(cloud, xyz=cloud.xyz * ratio, frame=placed)
+    return cloud.stretched(ratio, placed)
 
 
 def require_metric(cloud: Cloud) -> None:

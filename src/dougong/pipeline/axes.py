@@ -7,8 +7,6 @@ there every horizontal axis is as good as another: they differ by a turn.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -94,7 +92,7 @@ def upside_down(
     found = []
     for sentence, flip in _FLIPS.items():
         cloud = clouds[side]
-        turned = replace(cloud, xyz=cloud.xyz * np.array(flip, dtype=float))
+        turned = cloud.stretched(np.array(flip, dtype=float), cloud.frame)
         ready = prepare(turned, kinds[side], settings)
         pair = (ready, fixed) if side == "source" else (fixed, ready)
         score = max((h.score for h in plan_search(*pair, params.plan)), default=0.0)

@@ -218,7 +218,7 @@ def _on_ground(cloud: Cloud, factor: float) -> Ground:
     local = frame.origin * plan
     metres = replace(frame, origin=local, crs=None, unit_m=(1.0, 1.0, 1.0), step=None)
     return Ground(
-        cloud=replace(cloud, xyz=cloud.xyz * plan, frame=metres),
+        cloud=cloud.stretched(plan, metres),
         to_ground=np.asarray(frame.unit_m) * plan,
         factor=factor,
     )

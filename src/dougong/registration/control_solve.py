@@ -23,8 +23,9 @@ FEWEST_FOR_POSE = 3
 RIGID, SIMILAR = (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4, 5, 6)
 _THIN = 0.03
 _ZERO = np.zeros((7, 7))
-_REJECT = 3.29
-"""Normalised residual of a bad point: 1 in 1000 by chance (Baarda 1968)."""
+_REJECT = float(np.sqrt(stats.chi2.isf(1e-3, 3) / 3.0))
+"""Normalised residual, of three coordinates together, of a bad point: 1 in 1000 is as large by
+chance (after Baarda 1968)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

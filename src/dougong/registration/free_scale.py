@@ -91,7 +91,7 @@ def with_unit(cloud: Cloud, metres_per_unit: float) -> Cloud:
         unit_m=(x * metres_per_unit, y * metres_per_unit, z * metres_per_unit),
         crs=None,
     )
-    return replace(cloud, xyz=cloud.xyz * metres_per_unit, frame=frame)
+    return cloud.stretched(metres_per_unit, frame)
 
 
 def without_unit(cloud: Cloud) -> Cloud:
@@ -105,6 +105,7 @@ def scaled(cloud: Prepared, factor: float) -> Prepared:
     return replace(
         cloud,
         xyz=cloud.xyz * factor,
+        seen_from=None if cloud.seen_from is None else cloud.seen_from * factor,
         height_above_ground=cloud.height_above_ground * factor,
         weights_area=cloud.weights_area * factor**2,
         spacing_m=cloud.spacing_m * factor,

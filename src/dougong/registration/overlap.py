@@ -12,8 +12,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from dougong._boxes import corners_of
-from dougong._sorting import by_coordinates, sorted_places
+from dougong._sorting import by_coordinates, keys_of_rows, sorted_places
 from dougong.filters import neighbourhood
 from dougong.filters.neighbourhood import Neighbourhood, build_index
 from dougong.kernels import partners
@@ -90,12 +89,13 @@ def thin(points: Points, spacing_m: float) -> Index:
     Sorted by voxel. Ties go to the earlier point, so with `points` (n, 3) in canonical order the
     choice does not depend on the order of the input.
     """
-    low, high = (np.floor(corner / spacing_m) for corner in corners_of(points))
     cell = np.floor(points / spacing_m)
     off = points / spacing_m - cell - 0.5
-    cell -= low
-    size = high - low + 1.0
-    key = ((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]).astype(np.int64)
+    key = keys_of_rows(tuple(cell.astype(np.int64).T))
+    if key is None:
+        # Points strewn over more cells than a number counts, as strays at 1e6 m do.
+        _, place = np.unique(cell, axis=0, return_inverse=True)
+        key = place.reshape(-1).astype(np.int64)
     # Numbers that are not negative are in the order of their bits.
     by_distance = sorted_places(np.einsum("ij,ij->i", off, off).view(np.uint64))
     order = by_distance[sorted_places(key[by_distance])]

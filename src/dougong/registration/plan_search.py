@@ -25,6 +25,9 @@ from dougong.registration.result import Hypothesis
 from dougong.threads import for_blocks
 from dougong.typing import Transform
 
+_MOST_CELLS = 2_000_000
+"""Of a raster on which peaks are refined: 0.4 GB; the cell grows beyond 350 m square."""
+
 
 class PlanSearch(Parameters):
     """How finely yaw and plan are searched, and how many peaks are kept."""
@@ -32,7 +35,7 @@ class PlanSearch(Parameters):
     cell_m: Annotated[float, Field(gt=0)] = 0.5
     """Cell of the first search; grows with the extent so that the images stay small."""
     fine_cell_m: Annotated[float, Field(gt=0)] = 0.25
-    """Cell at which the peaks are refined."""
+    """Cell at which the peaks are refined; larger on sites of more than 350 m square."""
     max_cells: Annotated[int, Field(ge=64)] = 384
     """Rows and columns of the search images at most."""
     yaw_step_deg: Annotated[float, Field(gt=0, le=10)] = 2.0
@@ -98,6 +101,7 @@ def plan_search(
 def search(source: PlanView, target: PlanView, params: PlanSearch) -> list[PlanPose]:
     """Return the best separate poses in plan, refined, best correlation first."""
     cell = _cell(source, target, params)
+    finest = max(params.fine_cell_m, *(_finest(view) for view in (source, target)))
     peaks = _first_peaks(source, target, cell, params)
     kept = suppress(peaks, 0.75 * params.yaw_step_deg, 1.5 * cell, params.peaks)
     step = params.yaw_step_deg
@@ -108,18 +112,23 @@ def search(source: PlanView, target: PlanView, params: PlanSearch) -> list[PlanP
         kept = suppress(kept, params.separate_yaw_deg, max(params.separate_m, cell))
         if not kept:
             return []
-        if cell <= params.fine_cell_m:
+        if cell <= finest:
             return kept[: 2 * params.max_hypotheses]
         # A pose that correlates far less well cannot win on finer cells.
         kept = [pose for pose in kept if pose.score >= 0.4 * kept[0].score]
         kept = kept[: 3 * params.max_hypotheses]
-        cell, step = max(cell / 2.0, params.fine_cell_m), max(step / 2.0, 0.5)
+        cell, step = max(cell / 2.0, finest), max(step / 2.0, 0.5)
 
 
 def _cell(source: PlanView, target: PlanView, params: PlanSearch) -> float:
     """Return the first search's cell: `cell_m`, or what keeps the images within bounds."""
     reach = float((target.high - target.low).max()) + 1.4 * _radius(source)
     return max(params.cell_m, reach / (params.max_cells - 8))
+
+
+def _finest(view: PlanView) -> float:
+    """Return the cell below which a raster of a cloud would hold more than `_MOST_CELLS`."""
+    return float(np.sqrt(np.prod(view.high - view.low) / _MOST_CELLS))
 
 
 def _radius(view: PlanView) -> float:

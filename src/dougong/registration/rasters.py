@@ -93,52 +93,50 @@ def plan_raster(view: PlanView, cell_m: float, blur_cells: float, wall_share: fl
     place = np.floor((view.xyz[:, :2] - view.low) / cell_m).astype(np.int64)
     flat = place[:, 1] * columns + place[:, 0]
     size = int(rows * columns)
-    walls, occupied = _bands(view, flat, size, cell_m)
     has_points = np.bincount(flat, minlength=size) > 0
     has_ground = np.bincount(flat[view.is_ground], minlength=size) > 0
-    free = _free(view, occupied, has_points, has_ground)
     bands = len(view.edges_m) - 1
     out = np.empty((rows, columns, 3 * bands + 2), dtype=np.float32)
 
-    def blurred(values: NDArray[np.float64]) -> Raster:
-        image = np.ascontiguousarray(values.reshape(rows, columns, -1), dtype=np.float32)
+    def blurred(values: Values) -> Raster:
+        image = np.ascontiguousarray(values.reshape(rows, columns), dtype=np.float32)
         if blur_cells > 0:
             image = cv2.GaussianBlur(image, (0, 0), blur_cells, borderType=cv2.BORDER_CONSTANT)
-        return image.reshape(rows, columns, -1)
+        return image
 
-    out[..., :bands] = blurred(walls.real)
-    out[..., bands : 2 * bands] = blurred(walls.imag)
+    # Band by band: at a site's full size all bands together would be most of the memory.
+    occupied = np.empty((size, bands))
+    for band in range(bands):
+        cosine, sine, occupied[:, band] = _band(view, band, flat, size, cell_m)
+        out[..., band], out[..., bands + band] = blurred(cosine), blurred(sine)
+    free = _free(view, occupied, has_points, has_ground)
     # Free space weighs as much as what is occupied: the mean over the seen cells is zero.
-    balance = min(1.0, float(occupied.sum() / max(free.sum(), 1.0)))
-    out[..., 2 * bands : 3 * bands] = blurred(occupied - balance * free)
+    balance = min(1.0, float(occupied.sum() / max(float(free.sum()), 1.0)))
+    for band in range(bands):
+        signed = occupied[:, band] - balance * free[:, band]
+        out[..., 2 * bands + band] = blurred(signed)
     _balance(out, bands, wall_share)
     out[..., 3 * bands] = (out[..., : 3 * bands] ** 2).sum(axis=-1)
     out[..., 3 * bands + 1] = has_points.reshape(rows, columns)
     return out
 
 
-def _bands(
-    view: PlanView, flat: NDArray[np.int64], size: int, cell_m: float
-) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
-    """Return per cell and band the wall (size, b) as amount x double direction, and occupancy."""
-    heights = np.diff(view.edges_m)
-    walls = np.zeros((size, len(heights)), dtype=np.complex128)
-    occupied = np.zeros((size, len(heights)))
-    for band, height in enumerate(heights):
-        here = view.band == band
-        cell = flat[here]
-        # A wall that crosses the cell and fills half of its band counts in full; tall bands
-        # are filled by few walls, so at most 3 m are asked for.
-        full = cell_m * min(height, 3.0) * 0.5
-        wall, double = view.wall[here], view.double[here]
-        amount = np.bincount(cell, wall, size)
-        real = np.bincount(cell, wall * double.real, size)
-        imag = np.bincount(cell, wall * double.imag, size)
-        scale = np.minimum(amount / full, 1.0) / np.maximum(amount, 1e-12)
-        walls[:, band] = (real + 1j * imag) * scale
-        area = np.bincount(cell, view.area[here], size)
-        occupied[:, band] = np.minimum(area / (_FULL * cell_m**2), 1.0)
-    return walls, occupied
+def _band(
+    view: PlanView, band: int, flat: NDArray[np.int64], size: int, cell_m: float
+) -> tuple[Values, Values, Values]:
+    """Return the walls of a band, as amounts times cosines and sines, and occupancies (size,)."""
+    here = view.band == band
+    cell = flat[here]
+    # A wall that crosses the cell and fills half of its band counts in full; tall bands are filled
+    # by few walls, so at most 3 m are asked for.
+    full = cell_m * min(float(np.diff(view.edges_m)[band]), 3.0) * 0.5
+    wall, double = view.wall[here], view.double[here]
+    amount = np.bincount(cell, wall, size)
+    scale = np.minimum(amount / full, 1.0) / np.maximum(amount, 1e-12)
+    cosine = np.bincount(cell, wall * double.real, size) * scale
+    sine = np.bincount(cell, wall * double.imag, size) * scale
+    area = np.bincount(cell, view.area[here], size)
+    return cosine, sine, np.minimum(area / (_FULL * cell_m**2), 1.0)
 
 
 def _free(
@@ -146,17 +144,18 @@ def _free(
     occupied: NDArray[np.float64],
     has_points: NDArray[np.bool_],
     has_ground: NDArray[np.bool_],
-) -> NDArray[np.float64]:
-    """Return 1.0 where a sensor saw through the cell's band, (size, b)."""
+) -> NDArray[np.bool_]:
+    """Say where a sensor saw through the cell's band, (size, b)."""
     is_hit = occupied > _OCCUPIED
     if view.sees_from_above:
         # Nothing at or above this band in a column that was seen from above.
-        is_above = np.cumsum(is_hit[:, ::-1], axis=1)[:, ::-1] > 0
+        is_above = np.logical_or.accumulate(is_hit[:, ::-1], axis=1)[:, ::-1]
         is_free = ~is_above & has_points[:, None] & view.has_ground
     else:
-        is_below = np.cumsum(is_hit, axis=1) == 0
+        is_below = ~np.logical_or.accumulate(is_hit, axis=1)
         is_free = is_below & has_ground[:, None]
-    return np.where(is_free & (occupied == 0.0), 1.0, 0.0)
+    seen: NDArray[np.bool_] = is_free & (occupied == 0.0)
+    return seen
 
 
 def _balance(out: Raster, bands: int, wall_share: float) -> None:

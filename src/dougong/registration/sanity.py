@@ -69,7 +69,13 @@ def mirrored(cloud: Prepared) -> Prepared:
     """Return `cloud` with its x axis negated."""
     flip = np.array([-1.0, 1.0, 1.0])
     levelling = replace(cloud.levelling, up=cloud.levelling.up * flip)
-    return replace(cloud, xyz=cloud.xyz * flip, normals=cloud.normals * flip, levelling=levelling)
+    return replace(
+        cloud,
+        xyz=cloud.xyz * flip,
+        normals=cloud.normals * flip,
+        seen_from=None if cloud.seen_from is None else cloud.seen_from * flip,
+        levelling=levelling,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,7 +144,7 @@ def unit_by_search(
     height_ratio = _size(target.xyz)[1] / max(_size(source.xyz)[1], 1e-9)
     # The likelier one first: two surveys of a building have about the same height.
     for factor in sorted((1.0 / _FEET, _FEET), key=lambda f: abs(np.log(height_ratio / f))):
-        scaled = prepare(replace(source, xyz=source.xyz * factor), kind, settings)
+        scaled = prepare(source.stretched(factor, source.frame), kind, settings)
         found = plan_search(scaled, target, params)
         if found and found[0].score > bar:
             larger = "source" if factor < 1.0 else "target"

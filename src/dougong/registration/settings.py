@@ -11,6 +11,7 @@ from dougong.registration.congruent_sets import CongruentSets
 from dougong.registration.icp import Icp
 from dougong.registration.plan_search import PlanSearch
 from dougong.registration.prepare import Prepare
+from dougong.registration.principal_axes import ImprovedPca
 from dougong.registration.sample_consensus import SacIa
 from dougong.registration.verdict import Verdict
 
@@ -40,6 +41,7 @@ class Register(Parameters):
     """The caller takes the best pose of an ambiguous result; the status stays ambiguous."""
     prepare: Prepare = Prepare()
     plan: PlanSearch = PlanSearch()
+    improved_pca: ImprovedPca = ImprovedPca()
     sac_ia: SacIa = SacIa()
     congruent_sets: CongruentSets = CongruentSets()
     icp: Icp = Icp()

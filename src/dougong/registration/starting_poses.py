@@ -66,7 +66,7 @@ def coarse_poses(
     if params.coarse == "none":
         return [as_delivered(source, target, source_frame, target_frame, "none")]
     if params.coarse == "improved-pca":
-        return list(improved_pca(source, target))
+        return list(improved_pca(source, target, params.improved_pca))
     if params.coarse == "pca":
         return list(traditional_pca(source, target))
     if params.coarse == "sac-ia":
