@@ -299,3 +299,47 @@ def test_the_ground_tells_the_turns_of_a_house_apart(amplitude, status):
         middle = np.linalg.inv(truth) @ [0.0, 0.0, 3.0, 1.0]
         assert np.linalg.norm(found.matrix @ middle - [0.0, 0.0, 3.0, 1.0]) < 0.05
         assert np.degrees(np.arccos((np.trace(found.matrix[:3, :3] @ truth[:3, :3].T) - 1) / 2)) < 1
+
+
+def square_hall(spots, seed):
+    """A square hall on level paving with boxes about it."""
+    rng = np.random.default_rng(seed)
+    ground = np.column_stack([rng.uniform(-16, 16, (40_000, 2)), np.zeros(40_000)])
+    is_under = (np.abs(ground[:, :2]) < 4.0).all(axis=1)
+    parts = [box(rng, (0.0, 0.0), (8.0, 8.0, 5.0)) for _ in range(3)]
+    for k, spot in enumerate(spots):
+        size = SIZES[k % len(SIZES)]
+        parts.append(box(rng, spot, size))
+        is_under |= (np.abs(ground[:, :2] - spot) < np.array(size[:2]) / 2).all(axis=1)
+    points = np.vstack([ground[~is_under], *parts])
+    return points + rng.normal(0.0, 0.004, points.shape)
+
+
+@pytest.mark.parametrize(
+    ("spots", "status"),
+    [
+        ([(-9.0, -7.0), (-3.0, 8.5), (6.0, -9.0), (9.0, 4.0), (-11.0, 5.0)], "ok"),
+        # Close together they are one witness: who moves a scaffold moves all of its posts.
+        ([(9.0, y) for y in (-6.0, -3.0, 0.0, 3.0, 6.0)], "ambiguous"),
+        ([], "ambiguous"),
+    ],
+)
+def test_things_that_stand_apart_tell_the_turns_of_a_hall(spots, status):
+    truth = turned(140.0)
+    truth[:3, 3] = 30.0, -20.0, 2.0
+    one, two = square_hall(spots, 0), square_hall(spots, 1)
+    found = register(
+        Cloud.from_points((one - truth[:3, 3]) @ truth[:3, :3]),
+        Cloud.from_points(two),
+        source_kind="lidar",
+        target_kind="photogrammetry",
+    )
+    assert found.status == status, found.reason
+    if status == "ok":
+        off = np.linalg.norm(
+            one
+            - ((one - truth[:3, 3]) @ truth[:3, :3] @ found.matrix[:3, :3].T + found.matrix[:3, 3]),
+            axis=1,
+        )
+        assert off.max() < 0.05
+        assert "what stands about tells them apart" in found.reason
