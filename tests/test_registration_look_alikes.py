@@ -57,8 +57,7 @@ def court(spots, seed=0, sizes=SIZES, hole=None):
 
 
 def things_between(one, two):
-    heard = summon(one, two)
-    return things_of((one, heard.source.everything), (two, heard.target.everything), 0.2)
+    return replace(things_of(summon(one, two), one, two), near_m=0.2)
 
 
 def shifted(*by):

@@ -43,7 +43,7 @@ class Statistical(Parameters):
     mu and sigma are those of the whole cloud.
     """
 
-    neighbours: Annotated[int, Field(ge=1)] | None = 20
+    neighbours: Annotated[int, Field(ge=1, le=1000)] | None = 20
     """How many nearest neighbours are averaged. Left out when `radius_m` is given."""
     radius_m: Annotated[float, Field(gt=0)] | None = None
     """Average over all neighbours within this many metres instead."""

@@ -54,12 +54,7 @@ def look_alike_doubt(
     relief vouch for the winner, and two scans leave room for a copy that they do not show, or one
     part of the place alone speaks against a rival.
     """
-    spacing = max(witness.everything.spacing_m for witness in (court.source, court.target))
-    things = things_of(
-        (source, court.source.everything),
-        (target, court.target.everything),
-        court.tolerance_m + spacing,
-    )
+    things = things_of(court, source, target)
     winner = ruling.winner.T
     rivals = [c.T for c in ruling.beaten if not is_near(c.T, winner, ruling.middle)]
     for rival in rivals:
@@ -91,23 +86,29 @@ def look_alike_doubt(
         )
     if ground.is_vouched:
         return None
+    # The ruling may be of parts of both clouds.
+    best = hear(court, winner)
     # A flight shows a building from all sides.
     is_scanned = source.kind == target.kind == "lidar"
     if is_scanned and not telling.is_vouched:
-        unseen = _unseen_copy(court, grounds, ruling, rivals)
+        unseen = _unseen_copy(court, grounds, ruling, best, rivals)
         if unseen is not None:
             return unseen
-    return _rests_on_one_part(court, ruling, rivals, things, params)
+    return _rests_on_one_part(court, ruling, best, rivals, things, params)
 
 
 def _rests_on_one_part(
-    court: Court, ruling: Ruling, rivals: Sequence[Transform], things: Things, params: Verdict
+    court: Court,
+    ruling: Ruling,
+    winner: Testimony,
+    rivals: Sequence[Transform],
+    things: Things,
+    params: Verdict,
 ) -> str | None:
     """Return where one part of the place alone tells the winner from a rival, and may have moved.
 
     Things on that part may have moved with it; others may vouch.
     """
-    winner = ruling.winner
     for rival in rivals:
         part = deciding_part(court, winner, hear(court, rival), params)
         if part is None:
@@ -125,7 +126,11 @@ def _rests_on_one_part(
 
 
 def _unseen_copy(
-    court: Court, grounds: tuple[Points, Points], ruling: Ruling, rivals: Sequence[Transform]
+    court: Court,
+    grounds: tuple[Points, Points],
+    ruling: Ruling,
+    winner: Testimony,
+    rivals: Sequence[Transform],
 ) -> str | None:
     """Return where two scans that nothing else ties to one place leave room for a copy of it."""
     if court.source.free is not None and court.target.free is not None:
@@ -136,7 +141,7 @@ def _unseen_copy(
                     "and nothing that stands about tells which: the pose that explains most may "
                     f"lay one part on another. {_DECIDES}"
                 )
-    is_explained = np.split(ruling.winner.is_explained, [len(court.source.points)])
+    is_explained = np.split(winner.is_explained, [len(court.source.points)])
     if all(
         _shows_one_side(ground, witness, explained)
         for ground, witness, explained in zip(

@@ -26,6 +26,7 @@ from dougong.filters.clusters import clusters_of, members
 from dougong.filters.clutter_shapes import Shape, shape_of
 from dougong.filters.neighbourhood import Neighbourhood, build_index, nearest
 from dougong.kernels.raster import cell_min
+from dougong.registration.evidence import Court
 from dougong.registration.overlap import Rung, apply, inverse
 from dougong.registration.prepare import Prepared
 from dougong.typing import Index, Mask, Points, Transform, Values
@@ -242,11 +243,14 @@ def _counted(is_found: Mask, is_gone: Mask, group: Index | None) -> tuple[int, i
     return len(found), len(set(group[is_gone].tolist()) - found)
 
 
-def things_of(
-    source: tuple[Prepared, Rung], target: tuple[Prepared, Rung], near_m: float
-) -> Things:
-    """Return what stands about in two clouds, each with a rung of it."""
-    return Things(source=_side(*source), target=_side(*target), near_m=near_m)
+def things_of(court: Court, source: Prepared, target: Prepared) -> Things:
+    """Return what stands about in two clouds that are heard in `court`."""
+    one, two = court.source.everything, court.target.everything
+    return Things(
+        source=_side(source, one),
+        target=_side(target, two),
+        near_m=court.tolerance_m + max(one.spacing_m, two.spacing_m),
+    )
 
 
 def _side(prepared: Prepared, everything: Rung) -> _Side:

@@ -102,12 +102,7 @@ def _by_things(
     Under every other pose they are gone. Those close together count as one: posts of scaffolding
     that was moved are found together.
     """
-    spacing = max(court.source.everything.spacing_m, court.target.everything.spacing_m)
-    things = things_of(
-        (clouds[0], court.source.everything),
-        (clouds[1], court.target.everything),
-        court.tolerance_m + spacing,
-    )
+    things = things_of(court, *clouds)
     vouched: list[_Told] = []
     for k, T in enumerate(poses):
         rivals = [poses[int(j)] for j in np.flatnonzero(_elsewhere(poses, k, ruling))]
