@@ -51,6 +51,13 @@ def test_a_turn_keeps_its_centre_wherever_the_middle_is():
     assert move.turn_deg == pytest.approx(90.0)
 
 
+def test_a_small_turn_is_no_shift():
+    """A pose 0.4 degrees off was 'shifted by +0.01 m'."""
+    said = words(turned(0.4, about=MIDDLE, shift=(0.01, 0.0, 0.0)))
+    assert "turned by only +0.4 deg about the middle" in said
+    assert "shifted" not in said
+
+
 def test_a_ring_is_round():
     assert "is round" in words(turned(17.0), turned(100.0), turned(-61.0))
 

@@ -16,6 +16,8 @@ _ON_GRID_DEG = 2.0
 _MOST_FOLDS = 12
 _SAME_CENTRE_M = 1.5
 _UPRIGHT = 0.9
+_STILL_M = 0.05
+"""A pose whose middle moves less than this differs by a small turn, not by a shift."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,6 +35,11 @@ class Move:
     def is_turn(self) -> bool:
         """Say whether the poses differ by more than a shift."""
         return abs(self.turn_deg) >= _TURNED_DEG
+
+    @property
+    def is_slight(self) -> bool:
+        """Say whether they differ by a small turn, the middle staying where it is."""
+        return not self.is_turn and float(np.linalg.norm(self.shift)) < _STILL_M
 
 
 def move_between(winner: Transform, rival: Transform, middle: NDArray[np.float64]) -> Move:
@@ -64,12 +71,17 @@ def folds(turns_deg: Sequence[float]) -> int:
 def in_words(moves: Sequence[Move]) -> str:
     """Return what `moves`, from the best pose to its undecided rivals, have in common."""
     turns = [move for move in moves if move.is_turn]
-    upright = [m for m in moves if not m.is_turn and _is_upright(m.shift)]
-    level = [m for m in moves if not m.is_turn and not _is_upright(m.shift)]
+    slight = [move for move in moves if move.is_slight]
+    shifts = [move for move in moves if not (move.is_turn or move.is_slight)]
+    upright = [move for move in shifts if _is_upright(move.shift)]
+    level = [move for move in shifts if not _is_upright(move.shift)]
     said, deciding = [], []
     if turns:
         said.append(_turns_in_words(turns))
         deciding.append("a yaw hint")
+    if slight:
+        degrees = ", ".join(f"{m.turn_deg:+.1f} deg" for m in slight[:4])
+        said.append(f"turned by only {degrees} about the middle they fit as well")
     if level:
         said.append(_shifts_in_words(level))
     if upright:
@@ -90,6 +102,8 @@ def in_short(move: Move) -> str:
     """Return one move in a few words."""
     if move.is_turn:
         return f"turned by {move.turn_deg:+.0f} deg"
+    if move.is_slight:
+        return f"turned by {move.turn_deg:+.1f} deg"
     return f"shifted by {float(np.linalg.norm(move.shift)):.2g} m"
 
 
