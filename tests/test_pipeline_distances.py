@@ -137,6 +137,13 @@ def test_merged_points_carry_the_distance_of_their_place(pair, measured, tmp_pat
     assert np.isnan(nowhere.attribute("m3c2_distance")).all()
 
 
+def test_distances_of_an_earlier_run_are_replaced_whatever_type_they_came_back_in():
+    """A text file's column of zeros is read as whole numbers, which hold no distance."""
+    cloud = Cloud.from_points(np.zeros((3, 3)), m3c2_distance=np.zeros(3, np.uint8))
+    painted = Painter([]).painted(cloud)
+    assert np.isnan(painted.attribute("m3c2_distance")).all()
+
+
 def test_nothing_is_measured_without_a_pose_or_a_meeting(pair):
     from dataclasses import replace
 

@@ -13,6 +13,7 @@ from dougong.cloud import Cloud, Frame, Pieces
 from dougong.filters import neighbourhood
 from dougong.formats import write
 from dougong.formats.units import parse_crs
+from dougong.pipeline.marking import with_own
 from dougong.registration.distances import Distances, SignedDistances, signed_distances
 from dougong.registration.faces import Face, find_faces
 from dougong.registration.outward import outward
@@ -168,7 +169,7 @@ class Painter:
             nearest[found] = away[found]
             distance[found] = one.distance_m[observed][place[found]]
             lod[found] = one.signed.lod95_m[observed][place[found]]
-        return cloud.with_attribute(DISTANCE, distance).with_attribute(LOD, lod)
+        return with_own(with_own(cloud, DISTANCE, distance), LOD, lod)
 
     def pieces(self, pieces: Pieces) -> Pieces:
         """Return a cloud that comes in pieces with its distances."""

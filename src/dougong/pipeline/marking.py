@@ -49,9 +49,9 @@ def marked(
         cloud,
         [(is_ground, GROUND_CLASS), (is_noise, NOISE_CLASS), (is_clutter, CLUTTER_CLASS)],
     )
-    result = _with_ours(result, "dougong_reason", codes.astype(np.uint8))
+    result = with_own(result, "dougong_reason", codes.astype(np.uint8))
     for name, values in (details or {}).items():
-        result = _with_ours(result, name, values)
+        result = with_own(result, name, values)
     return result
 
 
@@ -65,8 +65,8 @@ def with_clutter(filtered: Filtered) -> Cloud:
     is_kept = filtered.codes == Reason.KEPT
     kind = filtered.details[CLUTTER][is_kept]
     result = with_classes(filtered.cloud, [(kind > 0, CLUTTER_CLASS)])
-    result = _with_ours(result, CLUTTER, kind)
-    return _with_ours(result, CLUTTER_MARGIN, filtered.details[CLUTTER_MARGIN][is_kept])
+    result = with_own(result, CLUTTER, kind)
+    return with_own(result, CLUTTER_MARGIN, filtered.details[CLUTTER_MARGIN][is_kept])
 
 
 def clutter_of(details: Mapping[str, NDArray[Any]], points: int) -> Mask:
@@ -99,7 +99,7 @@ def with_classes(cloud: Cloud, classes: list[tuple[NDArray[np.bool_], int]]) -> 
     return cloud.with_attribute("classification", new)
 
 
-def _with_ours(cloud: Cloud, name: str, values: NDArray[Any]) -> Cloud:
+def with_own(cloud: Cloud, name: str, values: NDArray[Any]) -> Cloud:
     """Return `cloud` with an attribute of our own, whatever type an earlier run's came back in."""
     stored = cloud.attribute(name)
     if stored is not None and not np.can_cast(values.dtype, stored.dtype):

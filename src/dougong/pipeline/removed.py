@@ -10,6 +10,7 @@ from dougong.cloud import Cloud
 from dougong.filters.protective import Taken
 from dougong.filters.selection import DETAIL, Reason
 from dougong.formats.faults import coordinate_hashes
+from dougong.pipeline.marking import with_own
 from dougong.pipeline.steps import GROUND
 from dougong.typing import Index, Points
 
@@ -74,9 +75,9 @@ def removed_sample(
     chosen = np.flatnonzero((codes != Reason.KEPT) & (codes != Reason.DECIMATED))
     if len(chosen) > most:
         chosen = chosen[_smallest(cloud.xyz[chosen], most)]
-    sample = cloud.select(chosen).with_attribute("dougong_reason", codes[chosen])
+    sample = with_own(cloud.select(chosen), "dougong_reason", codes[chosen])
     for name, values in (details or {}).items():
-        sample = sample.with_attribute(name, values[chosen])
+        sample = with_own(sample, name, values[chosen])
     return sample
 
 
