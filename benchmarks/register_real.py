@@ -29,10 +29,12 @@ from typing import Any
 import numpy as np
 
 from dougong.cloud import Cloud
-from dougong.evaluation.hard_trials import Points, inverse, moved, pose
+from dougong.evaluation.hard_trials import pose
 from dougong.evaluation.metrics import Truth, pose_errors
 from dougong.formats import read
 from dougong.registration import Register, register, register_object
+from dougong.registration.overlap import apply, inverse
+from dougong.typing import Points
 
 DATA = Path(os.environ.get("DOUGONG_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
 CUTS = ("half40", "half30", "concentric", "thin5")
@@ -65,11 +67,11 @@ def parts(points: Points, name: str, seed: int) -> tuple[Points, Points, Truth]:
     truth = Truth(
         T_target_source=inverse(T),
         T_best=inverse(T),
-        surface_points=moved(T, shared),
+        surface_points=apply(T, shared),
         surface_bent=shared,
     )
     source = points[in_source & is_source]
-    return moved(T, source), points[in_target & ~is_source], truth
+    return apply(T, source), points[in_target & ~is_source], truth
 
 
 def pairs(sets: list[str], cuts: list[str], seeds: list[int]) -> Iterator[tuple[Any, ...]]:
