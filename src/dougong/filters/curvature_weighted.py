@@ -5,13 +5,14 @@ METHOD.md 1.3, equations 1 to 6, in the readings that can work. Kernels are impo
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Literal, NamedTuple, TypeVar
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from dougong._checks import as_points
+from dougong._sorting import Scalar, unsorted
 from dougong.errors import InputError
 from dougong.filters import protective
 from dougong.filters.balls import BLUR, Balls, CellBalls, ExactBalls, Lattice, build_lattice
@@ -22,8 +23,6 @@ from dougong.filters.totals import Totals
 from dougong.params import Parameters
 from dougong.threads import for_blocks
 from dougong.typing import Index, Mask, Values
-
-Scalar = TypeVar("Scalar", bound=np.generic)
 
 KIND: Literal["local", "two-pass", "global"] = "local"
 
@@ -174,9 +173,7 @@ class _Judged(NamedTuple):
 
     def unsorted(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
         """Return `values` (n,), given in sorted order, in the caller's order."""
-        result = np.empty_like(values)
-        result[self.order] = values
-        return result
+        return unsorted(values, self.order)
 
     def verdict(self, p: CurvatureWeighted) -> tuple[Mask, Values]:
         """Return the verdict (n,) of eq. 6 and its margin (n,), m as a share of the cut.

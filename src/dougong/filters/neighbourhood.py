@@ -7,20 +7,18 @@ order, thread count or, since work is in local metres, on the coordinates' size.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dougong._boxes import corners_of
 from dougong._checks import as_points
-from dougong._sorting import unsorted
+from dougong._sorting import Scalar, unsorted
 from dougong.errors import InputError
 from dougong.kernels import boxtree, moments, neighbours, order, self_neighbours
 from dougong.threads import for_blocks
 from dougong.typing import Index, Mask, Points, Values
-
-Scalar = TypeVar("Scalar", bound=np.generic)
 
 _SUBTREES = 32
 """Parts of the tree that are built apart, on the threads."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from dougong._boxes import cells_in_plan
 from dougong.registration.evidence import Court, Testimony, structure_weights
 from dougong.registration.overlap import apply
 from dougong.registration.verdict import Verdict, compare, is_beaten
@@ -43,9 +44,7 @@ class DecidingPart:
 
     def holds(self, points: Points) -> Mask:
         """Say which `points` (n, 3), in the target's frame, stand on it."""
-        cell = np.floor((points[:, :2] - self.low) / _CELL_M)
-        is_on = np.all((cell >= 0) & (cell < self.held.shape), axis=1)
-        i, j = np.where(is_on[:, None], cell, 0.0).astype(np.int64).T
+        is_on, i, j = cells_in_plan(points, self.low, _CELL_M, self.held.shape)
         held: Mask = is_on & self.held[i, j]
         return held
 

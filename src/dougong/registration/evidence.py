@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._boxes import cells_in_plan
 from dougong.filters import neighbourhood
 from dougong.registration.free_space import FreeSpace, free_space
 from dougong.registration.overlap import (
@@ -69,9 +70,7 @@ class _Plan:
 
     def at(self, points: Points) -> tuple[Mask, Mask, Values]:
         """Return is_inside, is_within and the top (-inf outside) for `points` (n, 3)."""
-        place = np.floor((points[:, :2] - self.low) / self.cell_m)
-        is_on: Mask = np.all((place >= 0) & (place < self.covered.shape), axis=1)
-        i, j = np.where(is_on[:, None], place, 0.0).astype(np.int64).T
+        is_on, i, j = cells_in_plan(points, self.low, self.cell_m, self.covered.shape)
         is_inside: Mask = is_on & self.covered[i, j]
         is_within: Mask = is_on & self.within[i, j]
         return is_inside, is_within, np.where(is_on, self.top[i, j], -np.inf)

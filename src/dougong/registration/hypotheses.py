@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
+from dougong._boxes import cells_in_plan
 from dougong.filters import neighbourhood
 from dougong.registration.cleaning import extent
 from dougong.registration.levelling import rotation_to_vertical
@@ -168,10 +169,8 @@ def _one_way(T_to_from: Transform, one: _Side, other: _Side, finest_m: float) ->
 def _seen(points: Points, other: _Side) -> tuple[Mask, Mask]:
     """Return which `points` lie where `other` saw anything, and which stand in its free space."""
     level = points @ other.rotation.T
-    cell = np.floor((level[:, :2] - other.low) / _SEEN_CELL_M).astype(np.int64)
     rows, columns = other.is_seen.shape
-    is_inside: Mask = np.all((cell >= 0) & (cell < [columns, rows]), axis=1)
-    column, row = np.where(is_inside[:, None], cell, 0).T
+    is_inside, column, row = cells_in_plan(level, other.low, _SEEN_CELL_M, (columns, rows))
     is_seen: Mask = is_inside & other.is_seen[row, column]
     height = level[:, 2]
     with np.errstate(invalid="ignore"):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dougong._boxes import cells_in_plan
 from dougong.typing import Mask, Points, Values
 
 _CELL_M = 0.5
@@ -70,8 +71,6 @@ def _tops(site: Points) -> tuple[Values, Values, float]:
 
 def _at(top: Values, low: Values, cell: float, place: Points, ground: float) -> Values:
     """Return the top over each place (k, 2); the ground where nothing was seen."""
-    at = np.floor((np.nan_to_num(place) - low) / cell)
-    is_in = np.all((at >= 0) & (at < top.shape), axis=1)
-    i, j = np.where(is_in[:, None], at, 0.0).astype(np.int64).T
+    is_in, i, j = cells_in_plan(np.nan_to_num(place), low, cell, top.shape)
     found = np.where(is_in, top[i, j], -np.inf)
     return np.where(np.isfinite(found), found, ground)

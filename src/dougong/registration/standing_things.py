@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.stats import binom
 
+from dougong._boxes import cells_in_plan
 from dougong.filters.clusters import clusters_of, members
 from dougong.filters.clutter_shapes import Shape, shape_of
 from dougong.filters.neighbourhood import Neighbourhood, build_index, nearest
@@ -84,9 +85,7 @@ class _Floor(NamedTuple):
 
     def at(self, points: Points) -> Values:
         """Return the height (n,) of the ground at `points` (n, 3)."""
-        place = np.floor((points[:, :2] - self.low) / self.cell_m)
-        is_on = np.all((place >= 0) & (place < self.height.shape), axis=1)
-        i, j = np.where(is_on[:, None], place, 0.0).astype(np.int64).T
+        is_on, i, j = cells_in_plan(points, self.low, self.cell_m, self.height.shape)
         height: Values = np.where(is_on, self.height[i, j], np.nan)
         return height
 
