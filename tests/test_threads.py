@@ -63,6 +63,40 @@ def test_the_next_item_is_made_while_one_is_used():
         threads.set_threads(before)
 
 
+def test_each_of_many_jobs_is_done_and_comes_in_order(workers):
+    assert threads.each(lambda item: 2 * item, range(50)) == list(range(0, 100, 2))
+    assert threads.each(lambda item: item, []) == []
+
+
+def test_an_error_of_one_of_many_jobs_is_raised(workers):
+    with pytest.raises(ZeroDivisionError):
+        threads.each(lambda item: 1 / (item - 7), range(50))
+
+
+def test_jobs_for_all_threads_cut_nothing_further(workers):
+    """Each of 6 jobs does its blocks where it is; each of 2, with 3 threads, fans them out."""
+
+    def hands(_):
+        seen = set()
+        threads.for_blocks(40, 1, lambda *_: seen.add(threading.get_ident()))
+        return seen == {threading.get_ident()}
+
+    assert all(threads.each(hands, range(6)))
+    assert not any(threads.each(hands, range(2))) or workers == 1
+    # Whoever fanned them out is as free as before.
+    assert not hands(0) or workers == 1
+
+
+def test_many_jobs_run_at_the_same_time():
+    before = threads.get_threads()
+    threads.set_threads(2)
+    both = threading.Barrier(2)
+    try:
+        threads.each(lambda _: both.wait(10.0), range(2))
+    finally:
+        threads.set_threads(before)
+
+
 @pytest.mark.parametrize("count", [0, 1, 7, 100])
 @pytest.mark.parametrize("workers", [1, 3])
 def test_every_index_is_visited_once(count, workers):

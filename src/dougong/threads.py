@@ -5,15 +5,21 @@ do not depend on the thread count, so neither does any result, and Ctrl-C works 
 """
 
 import os
+import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar, cast
 
 Item = TypeVar("Item")
+Made = TypeVar("Made")
 
 _threads = max(
     1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 )
+
+
+_here = threading.local()
+"""Of each thread: whether it is one of those of `each`, which fan out nothing further."""
 
 
 def set_threads(count: int) -> None:
@@ -33,7 +39,7 @@ def for_blocks(count: int, block: int, task: Callable[[int, int], None]) -> None
     The first exception is raised; blocks not started by then are dropped.
     """
     starts = range(0, count, block)
-    if _threads == 1 or len(starts) <= 1:
+    if _threads == 1 or len(starts) <= 1 or getattr(_here, "is_one_of_many", False):
         for start in starts:
             task(start, min(start + block, count))
         return
@@ -45,6 +51,30 @@ def for_blocks(count: int, block: int, task: Callable[[int, int], None]) -> None
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def each(do: Callable[[Item], Made], items: Iterable[Item]) -> list[Made]:
+    """Return ``do(item)`` of all items, in their order, several at a time on the threads.
+
+    For jobs that spend much of their time outside of blocks: a pose's fit, a cloud's description.
+    What they cut into blocks stays in their thread where there are jobs for all threads. The first
+    exception is raised; jobs not started by then are dropped.
+    """
+    todo = list(items)
+    if _threads == 1 or len(todo) <= 1 or getattr(_here, "is_one_of_many", False):
+        return [do(item) for item in todo]
+    start = _be_one_of_many if len(todo) >= _threads else None
+    with ThreadPoolExecutor(_threads, initializer=start) as pool:
+        futures = [pool.submit(do, item) for item in todo]
+        try:
+            return [future.result() for future in futures]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _be_one_of_many() -> None:
+    _here.is_one_of_many = True
 
 
 def ahead(items: Iterable[Item]) -> Iterator[Item]:

@@ -270,13 +270,13 @@ def _listed(
 ) -> tuple[Hypothesis, ...]:
     """Return the winner, then the other refined poses and coarse ones, by score."""
     method = starts[0].method
-    best = Hypothesis(T_target_source=T, score=ranking.score(T, source, target), method=method)
-    refined = [
-        Hypothesis(
-            T_target_source=c.T, score=ranking.score(c.T, source, target), method=f"{method}, rival"
+    poses = [T, *(c.T for c in (*ruling.undecided, *ruling.beaten))]
+    best, *refined = (
+        Hypothesis(T_target_source=pose, score=score, method=f"{method}, rival" if k else method)
+        for k, (pose, score) in enumerate(
+            zip(poses, ranking.scores(poses, source, target), strict=True)
         )
-        for c in (*ruling.undecided, *ruling.beaten)
-    ]
+    )
     others = ranking.dedupe([*refined, *starts], source)
     middle = middle_of(source.xyz)
     others = [h for h in others if not is_same(h.T_target_source, T, middle)]

@@ -22,6 +22,7 @@ from dougong.registration.overlap import (
     rung,
 )
 from dougong.registration.prepare import Prepared
+from dougong.threads import each
 from dougong.typing import Mask, Points, Transform, Values
 
 _JUDGED_POINTS = 15_000
@@ -144,9 +145,10 @@ def summon(source: Prepared, target: Prepared) -> Court:
     """Return the court in which all poses of a pair are heard."""
     spacing = max(source.spacing_m, target.spacing_m)
     sigma = float(np.hypot(source.sigma_m, target.sigma_m))
+    witnesses = each(_witness, (source, target))
     return Court(
-        source=_witness(source),
-        target=_witness(target),
+        source=witnesses[0],
+        target=witnesses[1],
         tolerance_m=min(3.0 * sigma + _BENDING_M, 0.15) + 0.1 * spacing,
     )
 
@@ -331,19 +333,21 @@ def sharpness(court: Court, testimony: Testimony) -> float:
     weights = structure_weights(court)
     total = float(weights.sum())
     normals = np.vstack([court.source.normals @ testimony.T[:3, :3].T, court.target.normals])
-    ratios = []
-    for offset in _offsets(court):
+
+    def ratio(offset: NDArray[np.float64]) -> float:
         facing = np.abs(normals @ offset) > _FACING_COSINE * np.linalg.norm(offset)
         asked = weights * facing
         # Chance explains a few percent anywhere: ratios of less mean nothing.
         floor = 0.02 * float(asked.sum())
         if floor <= 0.02 * _LEAST_FACING * total:
-            continue
+            return np.inf
         away = testimony.T.copy()
         away[:3, 3] += offset
         beside = float(asked @ hear(court, away).is_explained)
-        ratios.append(float(asked @ testimony.is_explained) / max(beside, floor))
-    return min(ratios, default=0.0)
+        return float(asked @ testimony.is_explained) / max(beside, floor)
+
+    least = min(each(ratio, _offsets(court)))
+    return least if np.isfinite(least) else 0.0
 
 
 def _offsets(court: Court) -> list[NDArray[np.float64]]:

@@ -18,6 +18,7 @@ from dougong.registration.icp import Icp, Level, refined_pose
 from dougong.registration.overlap import Rung
 from dougong.registration.rivals import propose_mirrored
 from dougong.registration.verdict import Comparison, Verdict, compare, is_beaten
+from dougong.threads import each
 
 Handedness = Literal["right", "left", "open", "unknown"]
 
@@ -56,7 +57,7 @@ def handedness(
         for level in levels
     )
     flip = np.diag([*_FLIP, 1.0])
-    heard = [hear(other, refined_pose(mirrored, T @ flip, icp)) for T in poses]
+    heard = each(lambda T: hear(other, refined_pose(mirrored, T @ flip, icp)), poses)
     best = min(heard, key=lambda testimony: testimony.total)
     if is_beaten(compare(court, winner, best, params.block_m), params):
         return "right"

@@ -18,6 +18,7 @@ from dougong.registration.cleaning import extent
 from dougong.registration.levelling import rotation_to_vertical
 from dougong.registration.prepare import Prepared
 from dougong.registration.result import Hypothesis
+from dougong.threads import each
 from dougong.typing import Mask, Points, Transform, Values
 
 SEPARATE_DEG = 5.0
@@ -84,11 +85,18 @@ def score(T_target_source: Transform, source: Prepared, target: Prepared) -> flo
     return float(quality * free * min(1.0, support / _MIN_SUPPORT))
 
 
+def scores(poses: Sequence[Transform], source: Prepared, target: Prepared) -> list[float]:
+    """Return `score` of every pose (source -> target)."""
+    each(_side, (source, target))  # once, before many poses ask for them at the same time
+    return each(lambda T: score(T, source, target), poses)
+
+
 def rank(hypotheses: Sequence[Hypothesis], source: Prepared, target: Prepared) -> list[Hypothesis]:
     """Score every hypothesis, drop near copies of better ones, best first."""
+    poses = [hypothesis.T_target_source for hypothesis in hypotheses]
     scored = [
-        replace(hypothesis, score=score(hypothesis.T_target_source, source, target))
-        for hypothesis in hypotheses
+        replace(hypothesis, score=found)
+        for hypothesis, found in zip(hypotheses, scores(poses, source, target), strict=True)
     ]
     return dedupe(scored, source)
 

@@ -36,6 +36,7 @@ from dougong.registration.overlap import (
 )
 from dougong.registration.prepare import Prepared
 from dougong.registration.result import FineResult
+from dougong.threads import each
 from dougong.typing import Index, Transform, Values
 
 _LEAST_PAIRS = 60
@@ -102,17 +103,22 @@ def build_levels(source: Prepared, target: Prepared, params: Icp) -> tuple[Level
     last = params.last_distance_m or max(1.5 * spacing, 4.0 * sigma)
     last = min(last, first)
     bounds = np.geomspace(first, last, params.levels) if params.levels > 1 else [last]
+
+    def rungs(prepared: Prepared) -> list[Rung]:
+        few = params.points_per_level
+        return [rung(prepared, bound / 4.0, _MOST_SEARCHED, few) for bound in bounds]
+
     return tuple(
         Level(
-            source=rung(source, bound / 4.0, _MOST_SEARCHED, params.points_per_level),
-            target=rung(target, bound / 4.0, _MOST_SEARCHED, params.points_per_level),
+            source=one,
+            target=other,
             bound_m=float(bound),
             up_source=source.up,
             up_target=target.up,
             # One vertical from the walls and one from the instrument are not comparable.
             has_common_up=source.is_relevelled == target.is_relevelled,
         )
-        for bound in bounds
+        for one, other, bound in zip(*each(rungs, (source, target)), bounds, strict=True)
     )
 
 

@@ -38,6 +38,7 @@ from dougong.registration.result import Hypothesis, Registration
 from dougong.registration.sanity import is_mirrored, propose_scale
 from dougong.registration.settings import Register
 from dougong.registration.starting_poses import coarse_poses, heard, picked_poses, with_delivered
+from dougong.threads import each
 from dougong.typing import Kind
 
 
@@ -140,17 +141,18 @@ def _registered(
     settings = params.prepare.model_copy(update={"is_filtered": params.filtered})
 
     def tried(thinned: Sequence[Thinned]) -> _Tried:
-        one, two = (describe(*each, settings) for each in zip(thinned, kinds, strict=True))
+        described = zip(thinned, kinds, strict=True)
+        one, two = each(lambda cloud: describe(*cloud, settings), described)
         clock.lap("prepare")
         starts = _starts(one, two, (source.frame, target.frame), params, fit, surveyed)
         clock.lap("coarse")
         return _Tried(one, two, starts, decide(one, two, starts, params, clock, surveyed))
 
-    thinned = [thin(cloud, settings) for cloud in (source, target)]
+    thinned = each(lambda cloud: thin(cloud, settings), (source, target))
     best = tried(thinned)
     if best.is_refused:
         # Among many strays a true pose explains little: it is asked again without them.
-        without = [cloud.without_strays() for cloud in thinned]
+        without = each(Thinned.without_strays, thinned)
         again = tried(without) if without != thinned else best
         best = best if again.is_refused else again
     one, two, starts, found = best

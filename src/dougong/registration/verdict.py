@@ -7,7 +7,7 @@ not evidence: a round building turned by 180 degrees fits almost as well.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -38,6 +38,7 @@ from dougong.registration.rivals import (
     propose_rivals,
 )
 from dougong.registration.symmetry import in_words, move_between
+from dougong.threads import each
 from dougong.typing import Mask, Transform, Values
 
 _LEADERS = 2
@@ -196,16 +197,13 @@ def rule(
         What a yaw hint leaves; other poses are rivals only while nothing else is left.
     """
     at = middle_of(court.source.points)
-    poses = [_refined(court, levels, T, icp) for T in starts[: params.poses]]
-    poses = separate(poses, at)
+    poses = separate(_all_refined(court, levels, starts[: params.poses], icp), at)
     rivals = propose_rivals(court, poses[0], params.rivals)
-    poses = separate([*poses, *(_refined(court, levels, T, icp) for T in rivals)], at)
+    poses = separate([*poses, *_all_refined(court, levels, rivals, icp)], at)
     best = poses[0]
     poses = [pose for pose in poses if is_allowed(pose.T)] or poses
-    near = [
-        _refined(court, levels, T, icp)
-        for T in propose_neighbours(court, poses[0], params.neighbours)
-    ]
+    beside = propose_neighbours(court, poses[0], params.neighbours)
+    near = _all_refined(court, levels, beside, icp)
     near = [pose for pose in near if is_allowed(pose.T) or not is_allowed(poses[0].T)]
     winner, twins = _told_apart(court, [poses[0], *near])
     overruled = None
@@ -214,13 +212,12 @@ def rule(
         overruled = overruled if is_beaten(overruled, params) else None
     others = [pose for pose in poses[1:] if not is_same(pose.T, winner.T, at)]
     others = _looked_at_closely(court, levels, others, icp)
-    results = [
-        replace(
-            compare(court, winner, other, params.block_m),
-            p_shared=shared_chance(court, winner, other, params),
-        )
-        for other in others
-    ]
+
+    def held_against(rival: Testimony) -> Comparison:
+        shared = shared_chance(court, winner, rival, params)
+        return replace(compare(court, winner, rival, params.block_m), p_shared=shared)
+
+    results = each(held_against, others)
     results += [compare(court, winner, other, params.block_m) for other in twins]
     is_told = [
         c.p_shared is None and is_beaten(c, params, is_near(c.T, winner.T, at)) for c in results
@@ -256,7 +253,7 @@ def _looked_at_closely(
             is_same(pose.T, other.T, at, shift_m=np.inf) for other in leaders
         ):
             leaders.append(pose)
-            near = (_refined(court, levels, T, icp) for T in propose_neighbours(court, pose, 2))
+            near = _all_refined(court, levels, propose_neighbours(court, pose, 2), icp)
             same = [item for item in near if is_same(item.T, pose.T, at)]
             pose = min([pose, *same], key=lambda item: item.total)
         found.append(pose)
@@ -332,8 +329,11 @@ def shared_chance(
     return common.p_value if is_held and is_free else None
 
 
-def _refined(court: Court, levels: tuple[Level, ...], T: Transform, icp: Icp) -> Testimony:
-    return hear(court, refined_pose(levels, T, icp))
+def _all_refined(
+    court: Court, levels: tuple[Level, ...], starts: Iterable[Transform], icp: Icp
+) -> list[Testimony]:
+    """Return what is said about the poses that fits lead to from every start."""
+    return each(lambda T: hear(court, refined_pose(levels, T, icp)), starts)
 
 
 def status_of(ruling: Ruling, fine: FineResult | None, params: Verdict) -> tuple[Status, str]:
