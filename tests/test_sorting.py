@@ -10,6 +10,7 @@ from dougong._sorting import (
     by_coordinates,
     count_rows,
     distinct,
+    first_places,
     grouped,
     keys_of_rows,
     once,
@@ -31,6 +32,12 @@ def test_signed_numbers_are_sorted_stably(keys):
 @given(arrays(np.uint64, SIZES, elements=st.integers(0, 2**64 - 1)))
 def test_unsigned_numbers_are_sorted_over_all_64_bits(keys):
     np.testing.assert_array_equal(sorted_places(keys), np.argsort(keys, kind="stable"))
+
+
+@settings(deadline=None)
+@given(SIGNED)
+def test_first_places_are_numpys(keys):
+    np.testing.assert_array_equal(first_places(keys), np.unique(keys, return_index=True)[1])
 
 
 @settings(deadline=None)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.typing import Index
+from dougong.typing import Index, Mask
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 Number = TypeVar("Number", bound=np.integer[Any])
@@ -76,9 +76,20 @@ def distinct(keys: NDArray[Number]) -> NDArray[Number]:
 
 def once(ordered: NDArray[Number]) -> NDArray[Number]:
     """Return each of the ascending numbers `ordered` (n,) once."""
+    return ordered[_is_first(ordered)]
+
+
+def first_places(keys: NDArray[np.int64]) -> Index:
+    """Return the place of the first of each of `keys` (n,), the lowest number's first."""
+    order = sorted_places(keys)
+    return order[_is_first(keys[order])]
+
+
+def _is_first(ordered: NDArray[Number]) -> Mask:
+    """Return which of the ascending numbers `ordered` (n,) differ from the one before."""
     is_first = np.ones(len(ordered), np.bool_)
     is_first[1:] = ordered[1:] != ordered[:-1]
-    return ordered[is_first]
+    return is_first
 
 
 def count_rows(cells: NDArray[np.int64]) -> int:
@@ -109,8 +120,7 @@ def grouped(keys: NDArray[np.int64]) -> Groups:
     """Return the groups of equal `keys` (n,)."""
     order = sorted_places(keys)
     ordered = keys[order]
-    is_first = np.ones(len(keys), np.bool_)
-    is_first[1:] = ordered[1:] != ordered[:-1]
+    is_first = _is_first(ordered)
     place = np.empty(len(keys), np.int64)
     place[order] = np.cumsum(is_first) - 1
     starts = np.flatnonzero(is_first)

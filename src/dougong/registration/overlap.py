@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from dougong._sorting import by_coordinates, keys_of_rows, sorted_places
+from dougong._sorting import by_coordinates, first_places, keys_of_rows, sorted_places
 from dougong.filters import neighbourhood
 from dougong.filters.neighbourhood import Neighbourhood, build_index
 from dougong.kernels import partners
@@ -98,11 +98,7 @@ def thin(points: Points, spacing_m: float) -> Index:
         key = place.reshape(-1).astype(np.int64)
     # Numbers that are not negative are in the order of their bits.
     by_distance = sorted_places(np.einsum("ij,ij->i", off, off).view(np.uint64))
-    order = by_distance[sorted_places(key[by_distance])]
-    is_first = np.ones(len(order), dtype=bool)
-    is_first[1:] = key[order[1:]] != key[order[:-1]]
-    kept: Index = order[is_first]
-    return kept
+    return by_distance[first_places(key[by_distance])]
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._sorting import distinct, first_places
 from dougong.report.layers import Cores, Layer
 from dougong.typing import Points, Transform, Values
 
@@ -53,18 +54,18 @@ def thinned(points: Points, most: int) -> NDArray[np.int64]:
     fine = coarse / 2**17
     for _ in range(14):
         middle = float(np.sqrt(fine * coarse))
-        if len(_firsts(points, middle)) > most:
+        if len(distinct(_cells(points, middle))) > most:
             fine = middle
         else:
             coarse = middle
-    return _firsts(points, coarse)
+    return np.sort(first_places(_cells(points, coarse)))
 
 
-def _firsts(points: Points, edge: float) -> NDArray[np.int64]:
-    cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
-    keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
-    chosen: NDArray[np.int64] = np.sort(np.unique(keys, return_index=True)[1])
-    return chosen
+def _cells(points: Points, edge: float) -> NDArray[np.int64]:
+    """Return the number of each point's cell (n,)."""
+    x, y, z = np.floor((points - points.min(axis=0)) / edge).astype(np.int64).T
+    cells: NDArray[np.int64] = (x << 42) | (y << 21) | z
+    return cells
 
 
 def sizes(points: Points) -> Values:
