@@ -17,8 +17,9 @@ from dougong.registration.prepare import Prepared
 from dougong.registration.result import FineResult, Status
 from dougong.registration.rivals import is_same, middle_of
 from dougong.registration.settings import Register
+from dougong.registration.status import status_of
 from dougong.registration.told_apart import told_apart
-from dougong.registration.verdict import Ruling, rule, status_of
+from dougong.registration.verdict import Ruling, rule
 from dougong.typing import Transform
 
 

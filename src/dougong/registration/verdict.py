@@ -7,9 +7,9 @@ not evidence: a round building turned by 180 degrees fits almost as well.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,6 @@ from dougong.registration.evidence import (
 from dougong.registration.icp import Icp, Level, refined_pose
 from dougong.registration.overlap import apply, inverse
 from dougong.registration.randomisation import sign_flip, student
-from dougong.registration.result import FineResult, Status
 from dougong.registration.rivals import (
     is_near,
     is_same,
@@ -37,7 +36,6 @@ from dougong.registration.rivals import (
     propose_neighbours,
     propose_rivals,
 )
-from dougong.registration.symmetry import in_words, move_between
 from dougong.threads import each
 from dougong.typing import Mask, Transform, Values
 
@@ -212,29 +210,44 @@ def rule(
         overruled = overruled if is_beaten(overruled, params) else None
     others = [pose for pose in poses[1:] if not is_same(pose.T, winner.T, at)]
     others = _looked_at_closely(court, levels, others, icp)
-
-    def held_against(rival: Testimony) -> Comparison:
-        shared = shared_chance(court, winner, rival, params)
-        return replace(compare(court, winner, rival, params.block_m), p_shared=shared)
-
-    results = each(held_against, others)
-    results += [compare(court, winner, other, params.block_m) for other in twins]
-    is_told = [
-        c.p_shared is None and is_beaten(c, params, is_near(c.T, winner.T, at)) for c in results
-    ]
-    beaten = [c for c, told in zip(results, is_told, strict=True) if told]
-    undecided = [c for c, told in zip(results, is_told, strict=True) if not told]
-    explained, sharp = support(court, winner), sharpness(court, winner)
+    undecided, beaten = _compared(court, winner, others, twins, params)
     return Ruling(
         winner=winner,
         middle=at,
-        undecided=tuple(sorted(undecided, key=lambda c: c.gain)),
-        beaten=tuple(sorted(beaten, key=lambda c: c.gain)),
-        explained=explained,
-        sharpness=sharp,
+        undecided=undecided,
+        beaten=beaten,
+        explained=support(court, winner),
+        sharpness=sharpness(court, winner),
         violation=violation(court, winner),
         overruled=overruled,
     )
+
+
+def _compared(
+    court: Court,
+    winner: Testimony,
+    others: Sequence[Testimony],
+    twins: Sequence[Testimony],
+    params: Verdict,
+) -> tuple[tuple[Comparison, ...], tuple[Comparison, ...]]:
+    """Return the poses that cannot be told from the winner and those that it beats, closest first.
+
+    Of `others` it is asked what both clouds share, not of `twins`, which rest beside the winner.
+    """
+
+    def against(rival: Testimony) -> Comparison:
+        shared = shared_chance(court, winner, rival, params)
+        return replace(compare(court, winner, rival, params.block_m), p_shared=shared)
+
+    results = each(against, others)
+    results += [compare(court, winner, twin, params.block_m) for twin in twins]
+    results.sort(key=lambda comparison: comparison.gain)
+    at = middle_of(court.source.points)
+    is_told = [
+        c.p_shared is None and is_beaten(c, params, is_near(c.T, winner.T, at)) for c in results
+    ]
+    undecided = tuple(c for c, told in zip(results, is_told, strict=True) if not told)
+    return undecided, tuple(c for c, told in zip(results, is_told, strict=True) if told)
 
 
 def _looked_at_closely(
@@ -334,57 +347,3 @@ def _all_refined(
 ) -> list[Testimony]:
     """Return what is said about the poses that fits lead to from every start."""
     return each(lambda T: hear(court, refined_pose(levels, T, icp)), starts)
-
-
-def status_of(ruling: Ruling, fine: FineResult | None, params: Verdict) -> tuple[Status, str]:
-    """Return the status and, in words, what was seen and what would decide."""
-    if fine is not None and fine.fitness <= 0.0:
-        return "failed", "no pose lays one cloud on the other: nothing matches after refinement."
-    overlap = max(fine.overlap_source, fine.overlap_target) if fine is not None else 1.0
-    if ruling.sharpness < params.least_sharpness or ruling.explained < params.least_explained:
-        return "failed", (
-            f"the best pose explains {100 * ruling.explained:.0f} % of the structure near the "
-            f"other cloud, {ruling.sharpness:.1f} times what a pose half a metre beside it does "
-            f"(at least {100 * params.least_explained:.0f} % and {params.least_sharpness:g} times "
-            "expected). Are these two clouds of the same place, in the same unit, and do they "
-            "overlap?"
-        )
-    if overlap < params.least_overlap:
-        return "failed", (
-            f"only {100 * overlap:.0f} % of either cloud has the other within reach (at least "
-            f"{100 * params.least_overlap:.0f} % expected). Scan more of what both show; where "
-            "they are known to share so little, allow less (least_overlap) and check the result."
-        )
-    if ruling.violation > params.most_violation:
-        return "failed", (
-            f"under the best pose {100 * ruling.violation:.0f} % of the structure stands where the "
-            f"other cloud saw free space (at most {100 * params.most_violation:.0f} % expected): "
-            "the true pose was not found, or the place was rebuilt. A yaw hint or control points "
-            "would help."
-        )
-    if ruling.overruled is not None:
-        return "ambiguous", (
-            f"the clouds contradict the hint or the control points: a pose elsewhere explains "
-            f"{100 * ruling.overruled.gain:.1f} % more of the surface (p = "
-            f"{max(ruling.overruled.p_value, 1e-9):.1g}). Check them, or register without them."
-        )
-    if ruling.undecided:
-        moves = [move_between(ruling.winner.T, c.T, ruling.middle) for c in ruling.undecided]
-        return "ambiguous", in_words(moves)
-    loose: Sequence[Mapping[str, Any]] = fine.unobservable if fine is not None else ()
-    if loose:
-        texts = "; ".join(str(item["text"]) for item in loose)
-        return "ambiguous", (
-            f"the shared surface does not hold the pose: it {texts}. Control points, or surface "
-            "facing that way in both clouds, would decide."
-        )
-    beaten = ruling.told or (
-        f"the next pose contradicts {100 * ruling.beaten[0].gain:.1f} % more of the surface "
-        f"(p = {max(ruling.beaten[0].p_value, 1e-9):.1g} over {ruling.beaten[0].blocks} blocks)"
-        if ruling.beaten
-        else "no other pose fits at all"
-    )
-    return "ok", (
-        f"the pose explains {100 * ruling.explained:.0f} % of the structure near the other cloud, "
-        f"{ruling.sharpness:.1f} times what a pose half a metre beside it does; {beaten}."
-    )
