@@ -1,15 +1,17 @@
 """Many clouds in one frame: who is placed by whom, what checks it, and what is named wrong."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import dougong
-from dougong.cloud import Cloud
+from dougong.cloud import Cloud, Frame
 from dougong.pipeline.progress import Silent
 from dougong.pipeline.project import Project
 from dougong.pipeline.run import run
 from dougong.pipeline.store import Store
-from dougong.registration.network import local_matrix
+from dougong.registration.network import PairLink, join, local_matrix
 from dougong.registration.result import FineResult, Hypothesis, Registration
 from registration_sites import motion
 
@@ -179,6 +181,22 @@ def test_a_lone_link_that_others_should_confirm_is_unsure(network):
     result = network(holds, wrong=[("d", "c")])
     assert set(misses(result)) == set("bc")
     assert set(result["network"]["contradicted"]) == set("de")
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 0, 1, 2), (2, 3, 1, 0)])
+def test_a_lone_link_is_doubted_for_what_hangs_on_it_in_any_order_of_links(order):
+    """a triangle that contradicts itself is no word against e, which hangs on a beside it."""
+    frames = {name: Frame() for name in "abce"}
+
+    def link(source, target, x, y=0.0):
+        matrix = motion(0.0, (x, y, 0.0))
+        clouds = (SimpleNamespace(frame=Frame()), SimpleNamespace(frame=Frame()))
+        return PairLink(source=source, target=target, result=sure(*clouds, matrix))
+
+    links = [link("b", "a", 1), link("c", "b", 1), link("c", "a", 3), link("e", "a", 0, 5)]
+    joined = join(frames, "a", [links[k] for k in order])
+    assert joined.contradicted == ()
+    assert "e" in joined.matrices
 
 
 def test_two_clouds_have_no_network(network, tmp_path):

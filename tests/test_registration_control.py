@@ -13,14 +13,14 @@ from dougong.errors import InputError
 from dougong.formats import write
 from dougong.pipeline.control import control_of, quality_document, read_control
 from dougong.pipeline.pairs import HEADER
-from dougong.registration import Register, register
+from dougong.registration import Prepare, Register, register
 from dougong.registration.checks import check_error, level_of, reaches
 from dougong.registration.control import adjust, local_control
 from dougong.registration.control_solve import ControlPoints
 from dougong.registration.covariance import displacement95
 from dougong.registration.overlap import apply
 from dougong.registration.result import FineResult
-from registration_sites import SETTINGS, polygon, site
+from registration_sites import SETTINGS, polygon, rectangle, site
 
 MAP = np.array([5e5, 4e6, 100.0])
 PLACES = np.array(
@@ -124,6 +124,15 @@ def test_a_bad_point_is_found_and_left_out(name):
     left = [n for n, used in zip(control.points.names, control.used, strict=True) if used]
     assert name not in left
     assert len(left) == 4
+
+
+def test_sigmas_that_are_too_small_make_no_third_of_the_points_bad():
+    """Three of six sound points were named bad, and the pose rested on the other three."""
+    T = motion()
+    for seed in range(5):
+        sound = points(T, 0.004, checks=0, seed=seed)
+        control, _, _ = local(replace(sound, sigma_m=np.full(len(sound), 5e-4)), T)
+        assert control.used.all()
 
 
 def test_points_of_another_frame_are_refused():
@@ -269,6 +278,48 @@ def test_control_points_that_the_clouds_contradict_are_not_followed_in_silence()
     turned = motion(33.0 + 20.0)
     found = register_site(OCTAGON, points(turned))
     assert found.status != "ok", found.reason
+
+
+def test_control_points_of_another_height_are_said_to_contradict_the_clouds():
+    """It was asked whether the clouds show one place, and control points were recommended."""
+    raised = motion()
+    raised[2, 3] += 3.0
+    found = register_site(polygon(4, 9.0) * [1.0, 0.6], points(raised))
+    assert found.status != "ok"
+    assert "contradict the hint or the control points" in found.reason
+
+
+def long_wall(seed, noise):
+    """A wall that may be slid along itself, on rough grass."""
+    rng = np.random.default_rng(seed)
+    grass = rectangle(rng, [-40, -12, 0], [80, 0, 0], [0, 24, 0], 15.0)
+    grass[:, 2] += rng.normal(0, 0.05, len(grass))
+    faces = [rectangle(rng, [-40, y, 0], [80, 0, 0], [0, 0, 5], 25.0) for y in (-1.5, 1.5)]
+    top = rectangle(rng, [-40, -1.5, 5], [80, 0, 0], [0, 3, 0], 25.0)
+    xyz = np.vstack([grass[np.abs(grass[:, 1]) > 1.5], *faces, top])
+    return xyz + rng.normal(0, noise, xyz.shape)
+
+
+def test_control_points_decide_between_poses_a_hand_apart():
+    """Within half a metre of them all poses were theirs, and undecided ones stayed so."""
+    rng = np.random.default_rng(1)
+    marks = np.array([[-35, -1.5, 4.0], [30, 1.5, 4.5], [0, -1.5, 1.0], [20, -1.5, 3.0]])
+    control = ControlPoints(
+        names=("A", "B", "C", "D"),
+        source=marks + rng.normal(0, 0.003, marks.shape),
+        target=marks,
+        sigma_m=np.full(4, 0.005),
+        is_check=np.zeros(4, bool),
+    )
+    scan, drone = long_wall(1, 0.004), long_wall(11, 0.012)
+    settings = Register(prepare=Prepare(min_spacing_m=0.2))
+    for control_given in (None, control):
+        found = register(
+            Cloud.from_points(scan), Cloud.from_points(drone), settings, control=control_given
+        )
+        assert (found.status == "ok") == (control_given is not None), found.reason
+    off = apply(found.matrix, marks) - marks
+    assert np.linalg.norm(off, axis=1).max() < 0.02
 
 
 def test_only_check_points_change_no_pose(undecided):

@@ -232,6 +232,28 @@ def test_what_cannot_be_registered_is_refused():
         register_object(np.ones((100, 3)), chair(1))
 
 
+def test_corners_that_triangles_repeat_count_once_and_in_any_order():
+    source, target = chair(81), moved(chair(82), motion(81))
+    plain = register_object(source, target, QUICK)
+    order = np.random.default_rng(0).permutation(2 * len(source))
+    soup = np.repeat(source, 2, axis=0)[order]
+    found = register_object(soup, np.repeat(target, 3, axis=0), QUICK)
+    assert found.status == plain.status
+    np.testing.assert_array_equal(found.T_target_source, plain.T_target_source)
+
+
+def test_no_pose_turns_by_more_than_is_known():
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0.0, np.radians(60.0), 0.0]).as_matrix()
+    source, target = chair(91), moved(chair(92), T)
+    within = register_object(source, target, QUICK.model_copy(update={"max_angle_deg": 70.0}))
+    assert errors(within.T_target_source, T, source)[0] < 5.0
+    beyond = register_object(source, target, QUICK.model_copy(update={"max_angle_deg": 20.0}))
+    for found in beyond.hypotheses:
+        assert errors(found.T_target_source, np.eye(4), source)[0] <= 25.0
+    assert beyond.status != "ok"
+
+
 def test_two_real_scans_of_a_lion_that_share_a_third(data):
     """Whatever the frames: what is kept of 60,000 points differs a little by where they lie."""
     estimate = np.loadtxt(data / "lion_scans/reference_T.txt")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dougong.cloud import Cloud
 from dougong.errors import InputError, RegistrationError
@@ -252,3 +253,21 @@ def test_a_file_that_cannot_be_used_is_refused(tmp_path, rows, header, said):
 def test_without_pairs_nothing_changes_and_refusals_stay(clouds):
     with pytest.raises(RegistrationError, match="usable points"):
         register(Cloud.from_points(PLACES), clouds[1])
+
+
+def test_the_scale_of_a_cloud_that_lies_askew_is_checked_where_its_pairs_lay_it():
+    """The check began at the pose of the levelled cloud, and said it could not be made."""
+    size, turn = 1.01, Rotation.from_euler("x", 25.0, degrees=True).as_matrix()
+    drone = survey("photogrammetry", seed=1)
+    source, places = (size * points @ turn.T for points in (survey("lidar"), PLACES))
+    found = register(
+        Cloud.from_points(source, name="scan"),
+        Cloud.from_points(drone, name="drone"),
+        Register(prepare=SETTINGS),
+        pairs=pairs(places, PLACES),
+        unscaled="source",
+    )
+    assert found.status == "ok", found.reason
+    assert np.cbrt(np.linalg.det(found.matrix[:3, :3])) == pytest.approx(1.0 / size, abs=3e-4)
+    moved_places = places @ found.matrix[:3, :3].T + found.matrix[:3, 3]
+    assert np.linalg.norm(moved_places - PLACES, axis=1).max() < 0.02

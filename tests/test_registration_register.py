@@ -13,6 +13,7 @@ from dougong.cloud import Cloud, Frame
 from dougong.errors import FrameError
 from dougong.registration import Register, register, registration_to_json
 from dougong.registration.file_coordinates import to_file_transform
+from dougong.registration.plan_search import PlanSearch
 from registration_sites import SETTINGS, as_cloud, motion, moved, site
 
 
@@ -47,6 +48,38 @@ def test_heights_in_another_unit_are_refused():
 def test_unknown_degrees_of_freedom_are_refused():
     with pytest.raises(ValidationError, match="dof"):
         Register(dof=8)
+
+
+@pytest.mark.parametrize(
+    ("part", "field", "value"),
+    [
+        ("plan", "yaw_hint_deg", 30.0),
+        ("icp", "dof", 4),
+        ("icp", "method", "point-to-point"),
+        ("prepare", "is_filtered", True),
+    ],
+)
+def test_a_field_of_a_part_that_would_have_no_effect_is_refused(part, field, value):
+    with pytest.raises(ValidationError, match=f"{part}.{field} = .* has no effect"):
+        Register.model_validate({part: {field: value}})
+
+
+def test_bands_of_height_ascend():
+    for edges in ((8.0, 4.0, 2.0), (2.0, 2.0)):
+        with pytest.raises(ValidationError, match="do not ascend"):
+            PlanSearch(band_edges_m=edges)
+
+
+@pytest.mark.parametrize(("lean_deg", "status"), [(0.0, "ok"), (0.12, "ambiguous")])
+def test_a_levelled_fit_of_clouds_that_lean_is_not_sure(lean_deg, status):
+    """A hundredth of a radian too little to be seen by the walls was 58 mm at the site's edge."""
+    lean = Rotation.from_euler("x", lean_deg, degrees=True).as_matrix()
+    scan, drone = as_cloud(site("lidar", 0) @ lean.T), as_cloud(site("photogrammetry", 1))
+    found = register(scan, drone, Register(prepare=SETTINGS, dof=4))
+    assert found.status == status, found.reason
+    assert ("lean 0.12 deg against each other" in found.reason) == (status == "ambiguous")
+    free = register(scan, drone, Register(prepare=SETTINGS))
+    assert free.status == "ok", free.reason
 
 
 def test_dof_may_be_text():

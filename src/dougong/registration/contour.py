@@ -25,7 +25,7 @@ class Contour(Parameters):
     max_cells: Annotated[int, Field(ge=16)] = 2048
     """... or the extent divided by this, whichever is coarser."""
     close_cells: Annotated[int, Field(ge=0)] = 1
-    """Holes up to this many cells wide are closed; 0: none."""
+    """Holes are closed by growing and shrinking by so many cells: those up to twice as wide."""
     blur_cells: Annotated[float, Field(gt=0)] = 1.4
     """Standard deviation of the Gaussian before the gradient."""
     high_percentile: Annotated[float, Field(gt=0, lt=100)] = 90.0

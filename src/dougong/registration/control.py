@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from dougong.cloud import Cloud
 from dougong.errors import InputError
@@ -56,6 +57,17 @@ class Control:
         off = miss(T, self.points, self.used)
         reach = _NEAR_M + _SIGMAS * self.points.sigma_m[self.used]
         return bool(np.mean(np.square(off / reach)) <= 1.0)
+
+    def refutes(self, T: Transform) -> bool:
+        """Say whether a fitted pose misses the used control points by more than may be.
+
+        By more than their sigmas allow, and by more than two right poses may differ.
+        """
+        off = miss(T, self.points, self.used)
+        if not len(off) or np.sqrt(np.mean(np.square(off))) <= DISAGREE_M:
+            return False
+        square = float(np.square(off / self.points.sigma_m[self.used]).sum())
+        return float(stats.chi2.sf(square, 3 * len(off))) < DISAGREE_P
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ free is an argument, and a rigid motion is one whose ln s is not.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -79,16 +79,15 @@ def own_pose(
 
     None: fewer than three, or on one line.
     """
-    used = used.copy()
-    while True:
-        T = _weighted_pose(points, used, free)
-        if T is None or int(used.sum()) <= FEWEST_FOR_POSE:
-            return T, used
-        centre = points.target[used].mean(axis=0)
-        _, bad = _worst(T, points, used, _ZERO, centre, free)
-        if bad is None:
-            return T, used
-        used[bad] = False
+
+    def worst(left: Mask) -> int | None:
+        T = _weighted_pose(points, left, free)
+        if T is None:
+            return None
+        return _worst(T, points, left, _ZERO, points.target[left].mean(axis=0), free)
+
+    used = _without_bad(worst, used, FEWEST_FOR_POSE)
+    return _weighted_pose(points, used, free), used
 
 
 def joint(
@@ -115,7 +114,9 @@ def joint(
     free : sequence of int
         Which unknowns move.
     """
-    used = _without_bad(clouds, points, used, information, centre, free)
+    used = _without_bad(
+        lambda left: _worst(clouds, points, left, information, centre, free), used, fewest=1
+    )
     T, at, covariance = clouds, np.zeros(7), _ZERO
     for _ in range(10):
         step, covariance = _solved(T, centre, points, used, information, free, at)
@@ -240,13 +241,13 @@ def _worst(
     information: NDArray[np.float64],
     centre: NDArray[np.float64],
     free: Sequence[int],
-) -> tuple[float, int | None]:
-    """Return the largest normalised residual, and its point where that is beyond chance.
+) -> int | None:
+    """Return the point of the largest normalised residual, where that is beyond chance.
 
     Each used point is held against the pose that all others (and the clouds' `information`) have
     without it, so a bad one cannot hide by pulling the pose towards itself.
     """
-    largest, bad = 0.0, None
+    largest, bad = _REJECT, None
     for place in np.flatnonzero(used):
         rest = used.copy()
         rest[place] = False
@@ -261,26 +262,19 @@ def _worst(
         size = float(np.sqrt(off @ np.linalg.solve(expected, off) / 3.0))
         if size > largest:
             largest, bad = size, int(place)
-    return largest, bad if largest > _REJECT else None
+    return bad
 
 
-def _without_bad(
-    clouds: Transform,
-    points: ControlPoints,
-    used: Mask,
-    information: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    free: Sequence[int],
-) -> Mask:
-    """Return `used` without the points that the clouds and the other points contradict.
+def _without_bad(worst: Callable[[Mask], int | None], used: Mask, fewest: int) -> Mask:
+    """Return `used` without the points that all others contradict, the `worst` of those left first.
 
-    At most a third of them (but one of two) can be bad: if more are, it is the clouds that differ,
-    and all are left in to say so.
+    At most a third of them (but one of two) can be bad: if more are, their sigmas are too small or
+    it is the clouds that differ, and all are left in to say so.
     """
     left = used.copy()
     most = max(1, int(used.sum()) // 3)
-    while int(left.sum()) > 1:
-        _, bad = _worst(clouds, points, left, information, centre, free)
+    while int(left.sum()) > fewest:
+        bad = worst(left)
         if bad is None:
             return left
         if int(used.sum()) - int(left.sum()) == most:

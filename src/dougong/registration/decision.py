@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.stats import chi2
 
 from dougong.registration import hypotheses as ranking
 from dougong.registration.control import Adjusted, Control, weigh_control
@@ -169,6 +170,10 @@ def _doubted(
         pulled = _weigh_points(source, target, ruling, fine, params)
         if pulled is not None:
             (status, reason), evidence = pulled, replace(evidence, spread_m=np.inf)
+    if status == "ok" and fine is not None and params.dof == 4:
+        leaning = _lean(source, target, ruling, fine, params)
+        if leaning is not None:
+            status, reason, evidence = "ambiguous", leaning, replace(evidence, spread_m=np.inf)
     if status == "ok":
         clouds = whole.court, whole.source, whole.target
         alike = look_alike_doubt(*clouds, ruling, params.verdict)
@@ -224,9 +229,8 @@ def _weigh_points(
     samplings of one surface then meet decimetres off, each block agreeing. None: they do meet.
     """
     icp = icp_of(params).model_copy(update={"method": "point-to-plane"})
-    plane = refine(source, target, ruling.winner.T, icp).T_target_source
-    off = apply(plane, source.xyz) - apply(fine.T_target_source, source.xyz)
-    apart = float(np.quantile(np.linalg.norm(off, axis=1), 0.95))
+    plane = refine(source, target, ruling.winner.T, icp)
+    apart = _apart_m(source, plane.T_target_source, fine.T_target_source)
     # The other half is for what the plane fit itself may be off.
     limit = params.verdict.most_spread_m / 2.0
     if apart <= limit:
@@ -236,6 +240,38 @@ def _weigh_points(
         f"{limit:.2g} m expected): the points are too far apart for the first. Use --fine "
         "point-to-plane."
     )
+
+
+def _lean(
+    source: Prepared, target: Prepared, ruling: Ruling, fine: FineResult, params: Register
+) -> str | None:
+    """Return why a levelled pose is not ok: the clouds lean against each other.
+
+    The fit that may tilt leaves the levelled one by more than its own covariance allows and by
+    more than half of what is correct. None: it does not.
+    """
+    icp = icp_of(params).model_copy(update={"dof": 6})
+    free = refine(source, target, ruling.winner.T, icp)
+    if free.covariance is None:
+        return None
+    turn = free.T_target_source[:3, :3] @ fine.T_target_source[:3, :3].T
+    tilt = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0]]) / 2.0
+    square = float(tilt @ np.linalg.solve(free.covariance[:2, :2], tilt))
+    apart = _apart_m(source, free.T_target_source, fine.T_target_source)
+    limit = params.verdict.most_spread_m / 2.0
+    if apart <= limit or chi2.sf(square, 2) >= params.verdict.p_value:
+        return None
+    return (
+        f"the clouds lean {np.degrees(np.linalg.norm(tilt)):.2f} deg against each other, which 4 "
+        f"degrees of freedom leave as it is: the two fits end {apart:.2g} m apart (95 %; at most "
+        f"{limit:.2g} m expected). Use --dof 6, or level the cloud that is not."
+    )
+
+
+def _apart_m(source: Prepared, one: Transform, other: Transform) -> float:
+    """Return how far apart two poses put 95 % of the source's points at most, metres."""
+    off = apply(one, source.xyz) - apply(other, source.xyz)
+    return float(np.quantile(np.linalg.norm(off, axis=1), 0.95))
 
 
 def refused(reason: str) -> Found:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field as Limits
 
 from dougong._checks import as_points
+from dougong._sorting import by_coordinates
 from dougong.errors import RegistrationError
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid
 from dougong.params import Parameters
@@ -43,9 +44,12 @@ from dougong.registration.pose_search import (
 from dougong.registration.result import Hypothesis
 from dougong.registration.sample_consensus import SacIa, consensus_poses
 from dougong.registration.surface import surface
+from dougong.threads import each
 from dougong.typing import Index, Points, Transform, Values
 
 MIN_POINTS = 50
+GRACE_DEG = 5.0
+"""A pose may turn by so much more than the largest angle that is known: people round."""
 SAME_DEG = 8.0
 SAME_RADII = 0.08
 """Starting poses nearer than this, in degrees and RMS radii, are one."""
@@ -66,7 +70,7 @@ class FreeRotation(Parameters):
     rotations: Annotated[int, Limits(ge=0)] = 3000
     """Rotations of the even grid; 0: axes and features only."""
     max_angle_deg: Annotated[float, Limits(gt=0, le=180)] = 180.0
-    """The source is known to be turned by no more than this."""
+    """The source is known to be turned by no more than this, give or take 5 degrees."""
     features: SacIa | None = SacIa(trials=100_000, returned=100)
     """Sample consensus on features; None: axes and grid only."""
     refined: Annotated[int, Limits(ge=1)] = 24
@@ -119,7 +123,7 @@ def register_object(
     InputError
         Not (n, 3), or not finite.
     RegistrationError
-        A cloud has fewer than 50 points, or all at one place.
+        A cloud has fewer than 50 points, each place counted once, or all at one place.
 
     Notes
     -----
@@ -130,10 +134,34 @@ def register_object(
     pair = object_pair(source, target, params)
     poses, _ = starting_poses(*pair.views, params)
     middle = time.perf_counter()
-    result = judge_poses(pair, poses, params)
+    result = _held_to_limit(pair, judge_poses(pair, poses, params), params)
     end = time.perf_counter()
     result.seconds.update({"search": middle - start, "fit": end - middle})
     return result
+
+
+def _held_to_limit(
+    pair: ObjectPair, found: ObjectRegistration, params: FreeRotation
+) -> ObjectRegistration:
+    """Return the verdict, not ``ok`` where a pose beyond the largest turn fits better.
+
+    Who was told wrongly finds some pose within the limit, and nothing to compare it with.
+    """
+    if found.status != "ok" or found.T_target_source is None or params.max_angle_deg >= 180.0:
+        return found
+    free = params.model_copy(update={"max_angle_deg": 180.0, "rotations": 0})
+    beyond, _ = starting_poses(*pair.views, free)
+    own = from_transform(found.T_target_source, *pair.views)
+    freed = judge_poses(pair, np.concatenate([own[None], beyond]), free)
+    best = freed.hypotheses[0].T_target_source
+    # As good a fit, by a symmetry, is what the limit is told for.
+    if freed.status != "ok" or len(_allowed(_flat(best)[None], params.max_angle_deg)):
+        return found
+    reason = (
+        "a pose that turns by more fits better than any within the largest turn that is said to "
+        f"be known, {params.max_angle_deg:g} deg (max_angle_deg): search without it"
+    )
+    return replace(found, status="ambiguous", reason=reason)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -146,12 +174,26 @@ class ObjectPair:
 
 def object_pair(source: Points, target: Points, params: FreeRotation) -> ObjectPair:
     """Check, thin and describe two clouds for `starting_poses` and `judge_poses`."""
-    one, two = as_points(source, "source"), as_points(target, "target")
-    views = (
-        _view(one, params.search_points, params, "source"),
-        _view(two, params.search_points, params, "target"),
+    clouds = (
+        _each_once(as_points(source, "source"), "source"),
+        _each_once(as_points(target, "target"), "target"),
     )
-    return ObjectPair(clouds=(one, two), views=views)
+    views = (
+        _view(clouds[0], params.search_points, params, "source"),
+        _view(clouds[1], params.search_points, params, "target"),
+    )
+    return ObjectPair(clouds=clouds, views=views)
+
+
+def _each_once(points: Points, name: str) -> Points:
+    """Return every point (n, 3) once, by its coordinates: triangles repeat their corners."""
+    ordered = points[by_coordinates(points)]
+    is_new = np.ones(len(ordered), np.bool_)
+    is_new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    if len(points) > 1 and is_new.sum() == 1:
+        msg = f"{name} has all {len(points)} points at one place. Check the file's columns."
+        raise RegistrationError(msg)
+    return ordered[is_new]
 
 
 def judge_poses(pair: ObjectPair, poses: Poses, params: FreeRotation) -> ObjectRegistration:
@@ -159,17 +201,23 @@ def judge_poses(pair: ObjectPair, poses: Poses, params: FreeRotation) -> ObjectR
 
     The same for every method that proposes poses.
     """
-    if not len(poses):
+    judged = _judge(pair.views, poses, params) if len(poses) else None
+    if judged is None:
+        turned = (
+            ""
+            if params.max_angle_deg >= 180.0
+            else (f" that turns by no more than {params.max_angle_deg:g} deg (max_angle_deg)")
+        )
         return ObjectRegistration(
             status="failed",
             T_target_source=None,
-            reason="the coarse search found no pose",
+            reason=f"the coarse search found no pose{turned}",
             hypotheses=(),
             explained_source=0.0,
             explained_target=0.0,
             sigma_m=float("nan"),
         )
-    return _answer(pair, _judge(pair.views, poses, params), params)
+    return _answer(pair, judged, params)
 
 
 def _view(points: Points, most: int, params: FreeRotation, name: str) -> View:
@@ -180,9 +228,6 @@ def _view(points: Points, most: int, params: FreeRotation, name: str) -> View:
     centre = points.mean(axis=0)
     # Normals come from all points, before any is left out.
     plane = surface(points - centre, params.normal_neighbours)
-    if not np.ptp(points, axis=0).max() > 0:
-        msg = f"{name} has all {len(points)} points at one place. Check the file's columns."
-        raise RegistrationError(msg)
     chosen = np.arange(len(points))
     voxel = float(np.ptp(points, axis=0).max()) / 400.0
     while len(chosen) > most:
@@ -239,12 +284,13 @@ def _field(view: View, radius: float) -> Field:
 
 
 def _allowed(poses: Poses, max_angle_deg: float) -> Poses:
-    """Return the poses that turn by no more than the limit (5 degrees of grace)."""
+    """Return the poses that turn by no more than the limit and `GRACE_DEG`; there may be none."""
     if max_angle_deg >= 180.0:
         return poses
     trace = poses[:, 0] + poses[:, 4] + poses[:, 8]
-    kept = trace >= 1.0 + 2.0 * np.cos(np.radians(min(max_angle_deg + 5.0, 180.0)))
-    return poses[kept] if kept.any() else poses
+    least = 1.0 + 2.0 * np.cos(np.radians(min(max_angle_deg + GRACE_DEG, 180.0)))
+    allowed: Poses = poses[trace >= least]
+    return allowed
 
 
 def _axes_poses(source: View, target: View) -> Poses:
@@ -292,15 +338,23 @@ class _Judged:
     sharpness: float
 
 
-def _judge(views: tuple[View, View], poses: Poses, params: FreeRotation) -> _Judged:
-    """Refine the starting poses and compare them pair by pair."""
+def _judge(views: tuple[View, View], poses: Poses, params: FreeRotation) -> _Judged | None:
+    """Refine the starting poses and compare them pair by pair.
+
+    None: none of them ends within the largest turn.
+    """
     source, target = (fitting.body_of(view) for view in views)
     radius, spacing = target.view.radius_m, max(v.spacing_m for v in views)
     reaches = (max(0.1 * radius, 3.0 * spacing), 2.5 * spacing)
-    refined = [fitting.fit(source, target, _matrix(pose), reaches, iterations=12) for pose in poses]
+    refined = each(
+        lambda pose: fitting.fit(source, target, _matrix(pose), reaches, iterations=12), poses
+    )
+    refined = [T for T in refined if len(_allowed(_flat(T)[None], params.max_angle_deg))]
+    if not refined:
+        return None
     sigma = evidence.noise_of(source, target, refined, 2.0 * spacing)
     court = evidence.court_of(source, target, max(sigma, 0.02 * spacing), 1.5 * spacing)
-    heard = sorted((evidence.hear(court, T) for T in refined), key=lambda h: h.total)
+    heard = sorted(each(lambda T: evidence.hear(court, T), refined), key=lambda h: h.total)
     kept: list[evidence.Testimony] = []
     for one in heard:
         if not any(fitting.near(one.T, k.T, ONE_DEG, SAME_RADII * radius) for k in kept):

@@ -18,7 +18,7 @@ from dougong.registration.result import FineResult, Status
 from dougong.registration.rivals import is_same, middle_of
 from dougong.registration.settings import Register
 from dougong.registration.status import status_of
-from dougong.registration.told_apart import told_apart
+from dougong.registration.told_apart import told_apart, told_by_control, without_refuted
 from dougong.registration.verdict import Ruling, rule
 from dougong.typing import Transform
 
@@ -80,9 +80,12 @@ def hear_pair(
         params.verdict,
         lambda T: is_near_hint(T, params) and (control is None or control.allows(T)),
     )
+    ruling = told_by_control(court, levels, ruling, control, quick, params.verdict)
     ruling = told_apart(court, clouds, levels, ruling, quick, params.verdict)
     clock.lap("proof")
     fine, adjusted = _refined(*clouds, ruling, params, control)
+    if control is not None and adjusted is not None:
+        ruling = without_refuted(ruling, control)
     clock.lap("fine")
     status, reason, spread = _judged(court, ruling, fine, params)
     return Heard(

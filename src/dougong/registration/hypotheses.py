@@ -113,14 +113,6 @@ def dedupe(hypotheses: Sequence[Hypothesis], source: Prepared) -> list[Hypothesi
     return kept
 
 
-def margin(hypotheses: Sequence[Hypothesis], source: Prepared) -> float:
-    """Return 1 - s2 / s1 over poses more than 5 degrees or 0.5 m apart; 1 when there is one."""
-    kept = dedupe(hypotheses, source)
-    if len(kept) < 2:
-        return 1.0 if kept else 0.0
-    return 1.0 - kept[1].score / kept[0].score if kept[0].score > 0 else 0.0
-
-
 def _are_separate(one: Hypothesis, other: Hypothesis, centre: Values) -> bool:
     a, b = one.T_target_source, other.T_target_source
     cosine = 0.5 * (np.trace(a[:3, :3].T @ b[:3, :3]) / _scale(a) / _scale(b) - 1.0)

@@ -206,7 +206,7 @@ def _run_level(
                 {
                     "level": float(number),
                     "max_distance_m": level.bound_m,
-                    "inlier_rmse_m": _rms(_distance(pairs, params), weights),
+                    "inlier_rmse_m": _inlier_rmse_m(pairs, weights, params),
                     "fitness": _asked_share(pairs.source, level),
                     "step_m": motion,
                 }
@@ -281,8 +281,14 @@ def _asked_share(source: Index, level: Level) -> float:
     return float(np.isin(level.source.asked, source).mean())
 
 
-def _rms(values: Values, weights: Values) -> float:
-    return float(np.sqrt(weights @ np.square(values) / max(float(weights.sum()), 1e-300)))
+def _inlier_rmse_m(pairs: Pairs, weights: Values, params: Icp) -> float:
+    """Return the root mean square distance of the pairs with robust `weights` above 0.
+
+    Each by the surface that it stands for: robust weights would tell the middle of a distribution.
+    """
+    surface = pairs.weights * (weights > 0.0)
+    square = np.square(_distance(pairs, params))
+    return float(np.sqrt(surface @ square / max(float(surface.sum()), 1e-300)))
 
 
 def _result(
@@ -307,7 +313,7 @@ def _result(
             found = found._replace(covariance=robust * found.covariance)
         loose = unobservable(pairs, weights, centre, params.dof, length, params.block_m)
         is_inlier = weights > 0.0
-        rmse = _rms(_distance(pairs, params)[is_inlier], pairs.weights[is_inlier])
+        rmse = _inlier_rmse_m(pairs, weights, params)
         fitness = _asked_share(pairs.source[is_inlier], level)
     return FineResult(
         T_target_source=T,

@@ -175,13 +175,14 @@ def _contradicted(
     nothing else checks may as well be the wrong one, and all that it alone holds is unsure.
     """
     unsure: set[str] = set()
-    for k, report in enumerate(network.links):
+    whole = _parts(names, kept)
+    for report in network.links:
         if report.is_checked:
             continue
-        rest = [*kept[:k], *kept[k + 1 :]]
-        part = _parts(names, rest)
+        ends = (report.source, report.target)
+        part = _parts(names, [link for link in kept if (link.source, link.target) != ends])
         for one, other in open_pairs:
-            if part[one] != part[other]:
+            if whole[one] == whole[other] and part[one] != part[other]:
                 unsure |= {name for name in network.poses if part[name] != part[reference]}
     return tuple(name for name in names if name in unsure)
 

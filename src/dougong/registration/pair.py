@@ -119,7 +119,7 @@ def register(
         pairs=own,
         control=None if control is None else control.moved(matrix),
     )
-    return from_levelled(straight, fit, matrix, source.name)
+    return from_levelled(straight, fit, matrix, source, cloud)
 
 
 def _registered(

@@ -365,19 +365,26 @@ def with_pairs(result: Registration, fit: PairFit) -> Registration:
     )
 
 
-def from_levelled(result: Registration, fit: PairFit, matrix: Transform, name: str) -> Registration:
-    """Return the result of a source that was levelled by `matrix` first, from its own file."""
+def from_levelled(
+    result: Registration, fit: PairFit, matrix: Transform, source: Cloud, level: Cloud
+) -> Registration:
+    """Return the result of `level`, which is `source` levelled by `matrix`, as one of `source`."""
     note = (
-        f"{name} lies askew: its z axis is {tilt_deg(starts_of(fit)[0]):.1f} deg from the vertical "
-        "by the pairs, so it was levelled by them before the search"
+        f"{source.name} lies askew: its z axis is {tilt_deg(starts_of(fit)[0]):.1f} deg from the "
+        "vertical by the pairs, so it was levelled by them before the search"
     )
     listed = tuple(
         replace(h, T_target_source=h.T_target_source @ matrix) for h in result.hypotheses
     )
     final = None if result.matrix is None else result.matrix @ matrix
+    turn = np.linalg.inv(level.frame.T_file_local()) @ matrix @ source.frame.T_file_local()
+    fine = result.fine
+    if fine is not None:
+        fine = replace(fine, T_target_source=fine.T_target_source @ turn)
     return replace(
         result,
         matrix=final,
+        fine=fine,
         hypotheses=listed,
         scale=result.scale * float(np.cbrt(np.linalg.det(matrix[:3, :3]))),
         notes=(note, *result.notes),

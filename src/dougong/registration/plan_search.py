@@ -6,12 +6,13 @@ moments or local features, so a plan without axes (round, square, octagonal) is 
 equal poses come out as equal peaks, and all of them are returned.
 """
 
+import itertools
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 from scipy import fft
 
 from dougong.kernels.plan import splat
@@ -64,6 +65,14 @@ class PlanSearch(Parameters):
     """Poses closer than this in yaw ..."""
     separate_m: Annotated[float, Field(gt=0)] = 0.5
     """... and than this in place are one."""
+
+    @field_validator("band_edges_m")
+    @classmethod
+    def _ascend(cls, edges: tuple[float, ...]) -> tuple[float, ...]:
+        if any(high <= low for low, high in itertools.pairwise(edges)):
+            msg = f"{edges} do not ascend; each border lies above the one before"
+            raise ValueError(msg)
+        return edges
 
 
 def plan_search(

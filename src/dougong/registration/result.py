@@ -61,7 +61,7 @@ class FineResult:
     unobservable: tuple[Mapping[str, Any], ...] = ()
     """Directions the data do not fix: {"vector": 6 numbers, "text": words}."""
     history: tuple[Mapping[str, float], ...] = ()
-    """Per iteration: level, max_distance_m, inlier_rmse_m, fitness, step."""
+    """Per iteration: level, max_distance_m, inlier_rmse_m, fitness, step_m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

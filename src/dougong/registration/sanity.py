@@ -7,9 +7,9 @@ import numpy as np
 from dougong.cloud import Cloud
 from dougong.registration.cleaning import extent, far_points
 from dougong.registration.plan_search import PlanSearch, plan_search
-from dougong.registration.prepare import Prepare, Prepared, prepare
+from dougong.registration.prepare import Prepared
 from dougong.registration.result import Hypothesis
-from dougong.typing import Kind, Points, Values
+from dougong.typing import Points, Values
 
 UNIT_RATIOS = {1000.0: "millimetres", 304.8: "millimetres and the other one in feet"}
 """Ratios of two lengths that betray two units, and what the larger number is likely in."""
@@ -94,8 +94,8 @@ def propose_scale(source: Cloud, target: Cloud) -> ScaleProposal | None:
 
     Sizes are the heights and widths of the boxes without far points. One site surveyed twice
     can differ a lot (one facade against a whole site), so only wild differences speak: above 20
-    in width *and* height. A ratio of 3.28 hides within what partial overlap does to sizes;
-    `unit_by_search` tests it by registration.
+    in width *and* height. A ratio of 3.28 hides within what partial overlap does to sizes; the
+    search with a free scale finds it.
     """
     one, other = _size(source.xyz), _size(target.xyz)
     if min(*one, *other) <= 0.0:
@@ -118,43 +118,6 @@ def propose_scale(source: Cloud, target: Cloud) -> ScaleProposal | None:
         "units) and register again."
     )
     return ScaleProposal(factor=unit if ratio > 1.0 else 1.0 / unit, ratio=ratio, sentence=sentence)
-
-
-def unit_by_search(
-    source: Cloud,
-    target: Prepared,
-    kind: Kind,
-    plain_score: float,
-    *,
-    settings: Prepare | None = None,
-    params: PlanSearch | None = None,
-) -> ScaleProposal | None:
-    """Search again with the source taken for feet, and for metres read as feet.
-
-    For use when the plain search found nothing good: a ratio of 3.28 cannot be seen in the
-    extents. Costs a preparation and a search for each of the two, the
-    likelier one first.
-
-    Parameters
-    ----------
-    plain_score : float
-        Best score of the source as it is; a proposal must beat it by a quarter and reach 0.4.
-    """
-    bar = max(_MIRROR_MIN, _MIRROR_LEAD * plain_score)
-    height_ratio = _size(target.xyz)[1] / max(_size(source.xyz)[1], 1e-9)
-    # The likelier one first: two surveys of a building have about the same height.
-    for factor in sorted((1.0 / _FEET, _FEET), key=lambda f: abs(np.log(height_ratio / f))):
-        scaled = prepare(source.stretched(factor, source.frame), kind, settings)
-        found = plan_search(scaled, target, params)
-        if found and found[0].score > bar:
-            larger = "source" if factor < 1.0 else "target"
-            sentence = (
-                f"the clouds fit when the source is multiplied by {factor:.5g} (score "
-                f"{found[0].score:.2f}, as it is {plain_score:.2f}): the {larger} seems to be in "
-                "feet; metres expected. Convert it, or set its CRS unit, and register again."
-            )
-            return ScaleProposal(factor=factor, ratio=float(height_ratio), sentence=sentence)
-    return None
 
 
 def _size(points: Points) -> Values:

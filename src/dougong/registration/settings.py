@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from dougong.params import Parameters
 from dougong.registration.congruent_sets import CongruentSets
@@ -18,6 +18,14 @@ from dougong.registration.verdict import Verdict
 Coarse = Literal["auto", "plan", "improved-pca", "pca", "sac-ia", "4pcs", "none"]
 _FACTORS = (0.9, 1.1)
 """Combined factors of survey projections, with room to spare."""
+
+_REPLACED = (
+    ("plan", "yaw_hint_deg", "yaw_hint_deg"),
+    ("icp", "dof", "dof"),
+    ("icp", "method", "fine"),
+    ("prepare", "is_filtered", "filtered"),
+)
+"""Fields of the parts, for whoever calls these alone, and those of the whole that replace them."""
 
 
 class Register(Parameters):
@@ -63,6 +71,16 @@ class Register(Parameters):
             )
             raise ValueError(msg)
         return factor
+
+    @model_validator(mode="after")
+    def _has_no_second_opinion(self) -> Self:
+        """Refuse a part's field that one of the whole replaces: it would have no effect."""
+        for part, name, instead in _REPLACED:
+            value = getattr(getattr(self, part), name)
+            if value != type(getattr(self, part)).model_fields[name].default:
+                msg = f"{part}.{name} = {value!r} has no effect here: set {instead} instead"
+                raise ValueError(msg)
+        return self
 
     @field_validator("dof", mode="before")
     @classmethod

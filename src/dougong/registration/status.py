@@ -13,14 +13,15 @@ from dougong.registration.verdict import Ruling, Verdict
 def status_of(ruling: Ruling, fine: FineResult | None, params: Verdict) -> tuple[Status, str]:
     """Return the status and, in words, what was seen and what would decide."""
     refusal = _refusal(ruling, fine, params)
-    if refusal is not None:
-        return "failed", refusal
     if ruling.overruled is not None:
-        return "ambiguous", (
+        # Where they say, no pose need hold: that is no word against the clouds.
+        return "ambiguous" if refusal is None else "failed", (
             f"the clouds contradict the hint or the control points: a pose elsewhere explains "
             f"{100 * ruling.overruled.gain:.1f} % more of the surface (p = "
             f"{max(ruling.overruled.p_value, 1e-9):.1g}). Check them, or register without them."
         )
+    if refusal is not None:
+        return "failed", refusal
     if ruling.undecided:
         moves = [move_between(ruling.winner.T, c.T, ruling.middle) for c in ruling.undecided]
         return "ambiguous", in_words(moves)

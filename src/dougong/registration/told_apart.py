@@ -1,5 +1,7 @@
 """Poses that the built surface cannot tell apart, told apart by marks: the ground, and things.
 
+Or by control points, where there are any.
+
 An octagon fits itself at eight turns, and ground counts a tenth of what walls do in the proof: flat
 ground agrees with any pose. But where it rises and falls, it does so once. So do lanterns, crates
 and trees, small beside the walls: each stands in one place.
@@ -7,12 +9,13 @@ and trees, small beside the walls: each stands in one place.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from dougong.registration.control import Control
 from dougong.registration.evidence import Court
 from dougong.registration.ground_relief import level_ground, likeness, relief
 from dougong.registration.icp import Icp, Level
@@ -61,15 +64,55 @@ def told_apart(
     told = _by_ground(court, clouds, poses, ruling) or _by_things(court, clouds, poses, ruling)
     if told is None:
         return ruling
-    refuted = [
-        Comparison(T=poses[k], gain=0.0, p_value=_CHANCE, blocks=0)
-        for k in np.flatnonzero(_elsewhere(poses, told.pose, ruling))
-    ]
+    refuted = _refuted(poses[k] for k in np.flatnonzero(_elsewhere(poses, told.pose, ruling)))
     alone = _about(court, levels, poses[told.pose], ruling, icp, params)
     if alone.sharpness < _SHARPER * params.least_sharpness:
         return ruling
     said = f"{len(refuted)} other poses fit the walls as well, and {told.said}"
-    return replace(alone, beaten=(*alone.beaten, *refuted), told=said)
+    return replace(alone, beaten=(*alone.beaten, *refuted), told=said, overruled=ruling.overruled)
+
+
+def told_by_control(
+    court: Court,
+    levels: tuple[Level, ...],
+    ruling: Ruling,
+    control: Control | None,
+    icp: Icp,
+    params: Verdict,
+) -> Ruling:
+    """Return the ruling on the undecided poses that control points do not refute, if there are any.
+
+    The ruling itself where they do not refute the winner: see `without_refuted`.
+    """
+    if control is None or not control.refutes(ruling.winner.T):
+        return ruling
+    left = [c.T for c in ruling.undecided if not control.refutes(c.T)]
+    if not left:
+        return ruling
+    again = rule(court, levels, left, icp, params, lambda T: not control.refutes(T))
+    return ruling if control.refutes(again.winner.T) else again
+
+
+def without_refuted(ruling: Ruling, control: Control) -> Ruling:
+    """Return the ruling with the undecided poses that control points refute among the beaten ones.
+
+    For where a pose holds that was adjusted with them.
+    """
+    is_refuted = [control.refutes(c.T) for c in ruling.undecided]
+    if not any(is_refuted):
+        return ruling
+    refuted = _refuted(c.T for c, out in zip(ruling.undecided, is_refuted, strict=True) if out)
+    return replace(
+        ruling,
+        undecided=tuple(c for c, out in zip(ruling.undecided, is_refuted, strict=True) if not out),
+        beaten=(*ruling.beaten, *refuted),
+        told=f"{len(refuted)} of the poses that fit as well miss the control points",
+    )
+
+
+def _refuted(poses: Iterable[Transform]) -> list[Comparison]:
+    """Return what is declared for poses that something else than the surface refutes."""
+    return [Comparison(T=T, gain=0.0, p_value=_CHANCE, blocks=0) for T in poses]
 
 
 def _by_ground(
