@@ -500,6 +500,16 @@ def test_a_wrong_project_is_told_in_words_and_without_its_contents(text, said, t
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a Linux device")
+def test_register_and_run_do_not_write_over_each_others_report(room, tmp_path, capsys):
+    out = tmp_path / "result"
+    out.mkdir()
+    (out / "report.html").write_text("of another command")
+    for tokens in (["register", str(room), str(room)], ["run", "--lidar", str(room)], ["demo"]):
+        assert call([*tokens, "--out", str(out)]) == 2
+        assert "report.html exists already" in capsys.readouterr().err
+    assert (out / "report.html").read_text() == "of another command"
+
+
 @pytest.mark.parametrize(
     ("redirect", "code", "said"),
     [
