@@ -26,6 +26,7 @@ from dougong.report.model import flat, from_registration, from_run
 from dougong.report.plates import length_text, line_chart, plate, round_length
 from dougong.report.render import environment, render
 from dougong.report.streaming import items_of
+from dougong.report.verdict import NO_CHECKS, accuracy
 
 TOP = View(
     right=np.array([1.0, 0, 0]),
@@ -541,6 +542,17 @@ def test_the_certificate_states_no_grade_without_check_points():
     words, html = certificate(surveyed(checks=0))
     assert "none is stated: no check points were held out" in words
     assert not re.search(r"LOA\d0 \(USIBD\)", html)
+
+
+def test_check_points_that_could_not_be_used_are_told_from_none():
+    """A failed registration was said to have been given no check points."""
+    unused = registration("failed", checks=surveyed(checks=8) | {"check": None, "level": None})
+    missed = {"required_level": "LOA20", "is_reached": False}
+    given, required = accuracy([unused], missed)
+    assert given.startswith("scan: 8 check points had no pose to be measured at")
+    assert required == "The required level, LOA20, is NOT reached."
+    assert accuracy([registration()], missed) == (NO_CHECKS, required)
+    assert "lie" in accuracy([registration(checks=surveyed(checks=8))], None)[0]
 
 
 def test_the_certificate_says_what_a_searched_scale_is_worth():
