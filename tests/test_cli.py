@@ -364,6 +364,18 @@ def test_a_name_that_the_terminal_cannot_show_is_printed_all_the_same(tmp_path):
     assert b"\\u4e09.xyz" in found.stdout
 
 
+def test_json_is_json_where_the_terminal_is_not_utf8(room):
+    named = room.with_name("s\u00e4ule.laz")
+    room.rename(named)
+    told = subprocess.run(
+        [sys.executable, "-m", "dougong", "info", str(named), "--json"],
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        check=True,
+    )
+    assert json.loads(told.stdout)["files"][0]["path"] == str(named)
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="a POSIX pipe")
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path, capsys):
     os.mkfifo(tmp_path / "pipe.ply")

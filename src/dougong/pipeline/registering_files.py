@@ -97,7 +97,7 @@ def register_files(
         target=two.cloud.name,
         source_frame=one.cloud.frame,
         target_frame=two.cloud.frame,
-        files=[str(source.resolve())],
+        files=[str(source.absolute())],
     )
     write_registration(out, "registration", document, ends)
     return document
