@@ -512,6 +512,20 @@ def test_a_wrong_project_is_told_in_words_and_without_its_contents(text, said, t
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a Linux device")
+@pytest.mark.parametrize("count", [1, 20])
+def test_register_writes_its_document_where_a_cloud_is_too_small(room, tmp_path, capsys, count):
+    few = tmp_path / "few.laz"
+    dougong.write(Cloud.from_points(np.random.default_rng(0).uniform(0, 5, (count, 3))), few)
+    out = tmp_path / "out"
+    assert call(["register", str(few), str(room), "--out", str(out), "--json"]) == 1
+    document = json.loads((out / "registration.json").read_text())
+    assert (document["status"], document["matrix"]) == ("failed", None)
+    assert f"few has too few usable points ({count})" in document["reason"]
+    assert document["parameters"]["coarse"] == "auto"
+    assert json.loads(capsys.readouterr().out)["status"] == "failed"
+    assert "too few usable points" in (out / "report.html").read_text()
+
+
 def test_register_and_run_do_not_write_over_each_others_report(room, tmp_path, capsys):
     out = tmp_path / "result"
     out.mkdir()

@@ -24,6 +24,7 @@ from dougong.errors import RegistrationError
 from dougong.pipeline.links import Linked, register_pair
 from dougong.pipeline.movers import Mover, ReducedClouds
 from dougong.pipeline.progress import Progress
+from dougong.pipeline.registering import impossible
 from dougong.registration import Register
 from dougong.registration.control_solve import ControlPoints
 from dougong.registration.network import Joined, PairLink, is_adjustable, join, local_matrix
@@ -93,25 +94,11 @@ class _Search:
                 if len(self.movers) == 2:
                     raise
                 self.progress.note(f"{source} -> {target} is failed: {error}")
-                known = self._impossible(error)
+                # One of many: the others go on.
+                self.errors.append(error)
+                known = impossible(error, self.params)
             self.tried[source, target] = known
         return known
-
-    def _impossible(self, error: RegistrationError) -> Registration:
-        """Return the answer for a pair whose search cannot start: one of many, so others go on."""
-        self.errors.append(error)
-        return Registration(
-            status="failed",
-            matrix=None,
-            reason=str(error),
-            probability=0.0,
-            scale=1.0,
-            dof=self.params.dof if isinstance(self.params.dof, int) else 6,
-            coarse_method=self.params.coarse,
-            hypotheses=(),
-            margin=0.0,
-            fine=None,
-        )
 
     def is_tried(self, one: str, other: str) -> bool:
         """Say whether a pair was registered, either way round."""

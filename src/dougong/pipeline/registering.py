@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from dougong.cloud import Cloud
-from dougong.errors import FrameError
+from dougong.errors import FrameError, RegistrationError
 from dougong.formats import has_metric_format, is_same_crs, require_metric, units_of
 from dougong.formats.faults import coordinate_hashes
 from dougong.formats.projection import is_same_plan, projection_problem
@@ -91,6 +91,23 @@ def register(
         name = (source if undeclared == "source" else target).name
         notes = (*notes, _undeclared_note(name))
     return replace(result, notes=(*different_systems(source, target), *notes, *result.notes))
+
+
+def impossible(error: RegistrationError, params: Register) -> Registration:
+    """Return the answer for a pair whose search cannot even start."""
+    return Registration(
+        status="failed",
+        matrix=None,
+        reason=str(error),
+        probability=0.0,
+        scale=1.0,
+        dof=params.dof if isinstance(params.dof, int) else 6,
+        coarse_method=params.coarse,
+        hypotheses=(),
+        margin=0.0,
+        fine=None,
+        parameters=params.model_dump(mode="json"),
+    )
 
 
 def find_unit(
