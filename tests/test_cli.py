@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import pytest
 import dougong
 from dougong.cli import call
 from dougong.cli._common import Common
+from dougong.cli._signals import Terminated
 from dougong.cli._text import origin, table
 from dougong.cloud import Cloud
 from dougong.errors import InputError
@@ -602,6 +604,41 @@ def test_being_ended_while_the_program_loads_is_heard(flags, what, exit_code):
         assert json.loads(result.stdout)["error"]["exit_code"] == exit_code
     else:
         assert result.stderr == "cancelled.\n"
+
+
+@pytest.mark.parametrize(
+    ("verb", "tokens", "said"),
+    [
+        ("evaluate", ["growth"], "Rows measured so far are kept"),
+        ("evaluate", ["denoise"], "Nothing was written"),
+        ("filter_file", ["a.laz", "b.laz"], "Nothing was written"),
+        ("filter_file", ["a.laz", "b.laz", "--work", "w"], "are kept in w"),
+    ],
+)
+def test_a_cancelled_command_says_what_it_leaves(monkeypatch, capsys, verb, tokens, said):
+    def cancelled(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"dougong.app.{verb}", cancelled)
+    assert call([verb.removesuffix("_file"), *tokens]) == 130
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("how", "code"), [(KeyboardInterrupt, 0), (Terminated, 143)])
+def test_a_viewer_is_closed_by_ctrl_c_and_ended_by_sigterm(monkeypatch, how, code):
+    closed = []
+
+    told = {"clouds": ["a"], "points": 1, "url": "u", "is_browser_open": True, "notes": []}
+    viewing = SimpleNamespace(document=told, close=lambda: closed.append(how))
+
+    class Waiting:
+        def wait(self):
+            raise how
+
+    monkeypatch.setattr("dougong.app.view", lambda *_, **__: viewing)
+    monkeypatch.setattr("dougong.cli.view.threading", SimpleNamespace(Event=Waiting))
+    assert call(["view", "a.laz", "--quiet"]) == code
+    assert closed == [how]
 
 
 def test_a_folder_that_may_not_be_written_is_refused_before_the_work(room, capsys, monkeypatch):

@@ -70,7 +70,13 @@ def command(
         )
         return Answer(document=document, text=text)
 
-    return execute(common, work)
+    kept = ""
+    if common.work is not None:
+        kept = (
+            f"Finished tiles of a cloud larger than memory are kept in {common.work}; run it again "
+            "to go on."
+        )
+    return execute(common, work, kept)
 
 
 def _written(document: dict[str, Any]) -> str:

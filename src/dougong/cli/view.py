@@ -11,6 +11,7 @@ from dougong import app
 from dougong.cli import _text
 from dougong.cli._common import DEFAULT, Common
 from dougong.cli._shell import DONE, Answer, Listener, execute
+from dougong.cli._signals import Terminated, code_of
 
 if TYPE_CHECKING:
     from dougong.app import Viewing
@@ -75,9 +76,9 @@ def command(
         if code == DONE:
             sys.stdout.flush()
             threading.Event().wait()
-    except KeyboardInterrupt:
-        # This is how a viewer is closed: nothing has failed.
-        return DONE
+    except KeyboardInterrupt as ended:
+        # Ctrl-C is how a viewer is closed: nothing has failed.
+        return code_of(ended) if isinstance(ended, Terminated) else DONE
     finally:
         for viewing in opened:
             viewing.close()
