@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dougong import app
+from dougong._words import counted
 from dougong.cli import _text
 from dougong.cli._common import DEFAULT, Common
 from dougong.cli._shell import DONE, Answer, Listener, execute
@@ -62,7 +63,7 @@ def command(
         )
         opened.append(viewing)
         document = viewing.document
-        lines = [f"{', '.join(document['clouds'])}: {_text.count(document['points'])} points"]
+        lines = [f"{', '.join(document['clouds'])}: {counted(document['points'])}"]
         if browser and not document["is_browser_open"]:
             lines.append("NO BROWSER COULD BE OPENED here; open this address yourself:")
         lines.append(document["url"])

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from dougong._words import counted
+
 Tone = Literal["good", "unsure", "bad"]
 TONES: dict[str, Tone] = {"ok": "good", "ambiguous": "unsure", "failed": "bad"}
 WORDS: dict[Tone, str] = {"good": "Registered", "unsure": "Ambiguous", "bad": "Not registered"}
@@ -86,8 +88,7 @@ def _has_check_points(document: Mapping[str, Any]) -> bool:
 def _proved(source: str, checks: Mapping[str, Any]) -> str:
     """Return what the check points of a registration prove."""
     check = checks["check"]
-    count = checks["check_points"]
-    points = f"{count} check point{'s' if count != 1 else ''}"
+    points = counted(checks["check_points"], "check point")
     if check is None:
         return (
             f"{source}: {points} had no pose to be measured at, so no accuracy grade is stated "
