@@ -518,14 +518,22 @@ def test_a_wrong_project_is_told_in_words_and_without_its_contents(text, said, t
 def test_register_writes_its_document_where_a_cloud_is_too_small(room, tmp_path, capsys, count):
     few = tmp_path / "few.laz"
     dougong.write(Cloud.from_points(np.random.default_rng(0).uniform(0, 5, (count, 3))), few)
-    out = tmp_path / "out"
-    assert call(["register", str(few), str(room), "--out", str(out), "--json"]) == 1
+    out, control = tmp_path / "out", tmp_path / "control.csv"
+    control.write_text(
+        "name,cloud,source_x,source_y,source_z,target_x,target_y,target_z,sigma_m,role\n"
+        "a,few,1,2,3,500001,4000002,33,0.01,check\n"
+    )
+    tokens = ["register", str(few), str(room), "--out", str(out), "--control", str(control)]
+    assert call([*tokens, "--json"]) == 1
     document = json.loads((out / "registration.json").read_text())
     assert (document["status"], document["matrix"]) == ("failed", None)
     assert f"few has too few usable points ({count})" in document["reason"]
     assert document["parameters"]["coarse"] == "auto"
+    assert (document["checks"]["check_points"], document["checks"]["check"]) == (1, None)
     assert json.loads(capsys.readouterr().out)["status"] == "failed"
-    assert "too few usable points" in (out / "report.html").read_text()
+    page = (out / "report.html").read_text()
+    assert "too few usable points" in page
+    assert "1 check point had no pose to be measured at" in " ".join(page.split())
 
 
 def test_register_and_run_do_not_write_over_each_others_report(room, tmp_path, capsys):

@@ -21,6 +21,7 @@ import numpy as np
 from dougong._sorting import distinct
 from dougong.cloud import Cloud, Frame
 from dougong.errors import RegistrationError
+from dougong.pipeline.control import control_of
 from dougong.pipeline.links import Linked, register_pair
 from dougong.pipeline.movers import Mover, ReducedClouds
 from dougong.pipeline.progress import Progress
@@ -80,6 +81,7 @@ class _Search:
             There are two clouds, and no pose can even be looked for.
         """
         known = self.tried.get((source, target))
+        control = self.control if target == self.reference else {}
         if known is None:
             try:
                 known = register_pair(
@@ -87,7 +89,7 @@ class _Search:
                     self.movers[target],
                     (self.cloud(source), self.cloud(target)),
                     self.params,
-                    self.control if target == self.reference else {},
+                    control,
                     self.progress,
                 )
             except RegistrationError as error:
@@ -96,7 +98,8 @@ class _Search:
                 self.progress.note(f"{source} -> {target} is failed: {error}")
                 # One of many: the others go on.
                 self.errors.append(error)
-                known = impossible(error, self.params)
+                surveyed = control_of(control, source, self.movers[source].entry)
+                known = impossible(error, self.params, surveyed)
             self.tried[source, target] = known
         return known
 

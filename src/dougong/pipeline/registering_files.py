@@ -84,7 +84,7 @@ def register_files(
             control=surveyed,
         )
     except RegistrationError as error:
-        result = impossible(error, params)
+        result = impossible(error, params, surveyed)
     said = _still_true(result, one, two)
     if one.record["sha256"] == two.record["sha256"]:
         said.insert(0, f"{source.name} and {target.name} are the same file, or copies of one")
