@@ -8,7 +8,7 @@ import pytest
 import dougong
 
 PACKAGE = Path(dougong.__file__).parent
-BASE = {"errors", "typing", "params", "_boxes", "_checks", "threads"}
+BASE = {"errors", "typing", "params", "_boxes", "_checks", "_words", "threads"}
 ALLOWED = {
     "kernels": set(),
     "_sorting": BASE | {"kernels"},

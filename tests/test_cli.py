@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import pytest
 import dougong
 from dougong.cli import call
 from dougong.cli._common import Common
+from dougong.cli._signals import Terminated
 from dougong.cli._text import origin, table
 from dougong.cloud import Cloud
 from dougong.errors import InputError
@@ -364,6 +366,18 @@ def test_a_name_that_the_terminal_cannot_show_is_printed_all_the_same(tmp_path):
     assert b"\\u4e09.xyz" in found.stdout
 
 
+def test_json_is_json_where_the_terminal_is_not_utf8(room):
+    named = room.with_name("s\u00e4ule.laz")
+    room.rename(named)
+    told = subprocess.run(
+        [sys.executable, "-m", "dougong", "info", str(named), "--json"],
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        check=True,
+    )
+    assert json.loads(told.stdout)["files"][0]["path"] == str(named)
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="a POSIX pipe")
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path, capsys):
     os.mkfifo(tmp_path / "pipe.ply")
@@ -500,6 +514,38 @@ def test_a_wrong_project_is_told_in_words_and_without_its_contents(text, said, t
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a Linux device")
+@pytest.mark.parametrize("count", [1, 20])
+def test_register_writes_its_document_where_a_cloud_is_too_small(room, tmp_path, capsys, count):
+    few = tmp_path / "few.laz"
+    dougong.write(Cloud.from_points(np.random.default_rng(0).uniform(0, 5, (count, 3))), few)
+    out, control = tmp_path / "out", tmp_path / "control.csv"
+    control.write_text(
+        "name,cloud,source_x,source_y,source_z,target_x,target_y,target_z,sigma_m,role\n"
+        "a,few,1,2,3,500001,4000002,33,0.01,check\n"
+    )
+    tokens = ["register", str(few), str(room), "--out", str(out), "--control", str(control)]
+    assert call([*tokens, "--json"]) == 1
+    document = json.loads((out / "registration.json").read_text())
+    assert (document["status"], document["matrix"]) == ("failed", None)
+    assert f"few has too few usable points ({count})" in document["reason"]
+    assert document["parameters"]["coarse"] == "auto"
+    assert (document["checks"]["check_points"], document["checks"]["check"]) == (1, None)
+    assert json.loads(capsys.readouterr().out)["status"] == "failed"
+    page = (out / "report.html").read_text()
+    assert "too few usable points" in page
+    assert "1 check point had no pose to be measured at" in " ".join(page.split())
+
+
+def test_register_and_run_do_not_write_over_each_others_report(room, tmp_path, capsys):
+    out = tmp_path / "result"
+    out.mkdir()
+    (out / "report.html").write_text("of another command")
+    for tokens in (["register", str(room), str(room)], ["run", "--lidar", str(room)], ["demo"]):
+        assert call([*tokens, "--out", str(out)]) == 2
+        assert "report.html exists already" in capsys.readouterr().err
+    assert (out / "report.html").read_text() == "of another command"
+
+
 @pytest.mark.parametrize(
     ("redirect", "code", "said"),
     [
@@ -566,6 +612,41 @@ def test_being_ended_while_the_program_loads_is_heard(flags, what, exit_code):
         assert json.loads(result.stdout)["error"]["exit_code"] == exit_code
     else:
         assert result.stderr == "cancelled.\n"
+
+
+@pytest.mark.parametrize(
+    ("verb", "tokens", "said"),
+    [
+        ("evaluate", ["growth"], "Rows measured so far are kept"),
+        ("evaluate", ["denoise"], "Nothing was written"),
+        ("filter_file", ["a.laz", "b.laz"], "Nothing was written"),
+        ("filter_file", ["a.laz", "b.laz", "--work", "w"], "are kept in w"),
+    ],
+)
+def test_a_cancelled_command_says_what_it_leaves(monkeypatch, capsys, verb, tokens, said):
+    def cancelled(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"dougong.app.{verb}", cancelled)
+    assert call([verb.removesuffix("_file"), *tokens]) == 130
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("how", "code"), [(KeyboardInterrupt, 0), (Terminated, 143)])
+def test_a_viewer_is_closed_by_ctrl_c_and_ended_by_sigterm(monkeypatch, how, code):
+    closed = []
+
+    told = {"clouds": ["a"], "points": 1, "url": "u", "is_browser_open": True, "notes": []}
+    viewing = SimpleNamespace(document=told, close=lambda: closed.append(how))
+
+    class Waiting:
+        def wait(self):
+            raise how
+
+    monkeypatch.setattr("dougong.app.view", lambda *_, **__: viewing)
+    monkeypatch.setattr("dougong.cli.view.threading", SimpleNamespace(Event=Waiting))
+    assert call(["view", "a.laz", "--quiet"]) == code
+    assert closed == [how]
 
 
 def test_a_folder_that_may_not_be_written_is_refused_before_the_work(room, capsys, monkeypatch):

@@ -47,6 +47,9 @@ def test_bench_writes_rows_and_keeps_them(tmp_path):
     before = (tmp_path / "bench.json").stat().st_mtime_ns
     assert call(asked) == 0
     assert (tmp_path / "bench.json").stat().st_mtime_ns == before
+    assert call([*asked, "--seed", "3"]) == 0
+    (group,) = json.loads((tmp_path / "bench.json").read_text())["groups"].values()
+    assert group["seed"] == 3
 
 
 @pytest.mark.parametrize(

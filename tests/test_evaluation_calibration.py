@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+import dougong
 from dougong.evaluation import studies
 from dougong.evaluation.calibration import (
     SETTINGS,
@@ -14,6 +15,7 @@ from dougong.evaluation.calibration import (
     measure,
     reliability,
 )
+from dougong.evaluation.machine import code_hash
 from dougong.evaluation.studies import Setting, measured
 from dougong.evaluation.studies.probability import FIRST_SEED
 from dougong.evaluation.trial_pairs import KINDS, TRAINED, make_pair
@@ -134,6 +136,42 @@ def test_kept_rows_of_other_source_are_made_again(tmp_path, monkeypatch):
         (line,) = measured(setting, [("l",)], row, Silent())
     assert asked == ["l", "l"]
     assert line["value"] == 2
+
+
+def test_kept_rows_of_another_setting_are_made_again(tmp_path, monkeypatch):
+    """A quick look, stopped, became the first rows of the measurement."""
+    asked = []
+
+    def row(kind):
+        asked.append(kind)
+        return {"value": len(asked)}
+
+    kept = tmp_path / "rows.jsonl"
+    settings = [
+        {"is_quick": True},
+        {"is_quick": False},
+        {"points": 20_000},
+        {"data": tmp_path},
+        {"runs": 3},
+    ]
+    for number, setting in enumerate(settings):
+        measured(Setting(kept=kept, **setting), [("l",)], row, Silent())
+        assert len(asked) == min(number + 1, 4), "more runs only ask for more rows"
+    monkeypatch.setattr(studies, "get_threads", lambda: 77)
+    measured(Setting(kept=kept), [("l",)], row, Silent())
+    assert len(asked) == 5
+
+
+def test_the_code_of_a_measurement_includes_what_lies_beside_the_rooms(tmp_path, monkeypatch):
+    (tmp_path / "kernels").mkdir()
+    for name in ("__init__.py", "threads.py", "kernels/order.py", "report.py"):
+        (tmp_path / name).write_text(name)
+    monkeypatch.setattr(dougong, "__file__", str(tmp_path / "__init__.py"))
+    seen = {code_hash(["kernels"])}
+    for name in ("threads.py", "kernels/order.py"):
+        (tmp_path / name).write_text("changed")
+        seen.add(code_hash(["kernels"]))
+    assert len(seen) == 3
 
 
 def test_measures_of_calibration_against_their_definitions():

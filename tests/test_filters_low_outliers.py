@@ -7,8 +7,10 @@ from hypothesis import strategies as st
 
 from dougong import threads
 from dougong.errors import InputError
-from dougong.filters.cloth_simulation import ClothSimulation, cloth_simulation
-from dougong.filters.low_outliers import LowOutliers, halo_m, low_outliers
+from dougong.filters.cloth_simulation import ClothSimulation, cloth_notes, cloth_simulation
+from dougong.filters.low_outliers import LowOutliers, halo_m, low_notes, low_outliers
+from dougong.filters.pass_through import unknown_notes
+from dougong.filters.statistical import stray_notes
 from dougong.kernels import low_outliers as kernels
 from reference.cloth import hall_site, terrain
 
@@ -159,7 +161,7 @@ def test_what_it_says_and_refuses():
         low_outliers(points, LowOutliers(cell_m=0.1))
     ground = patch(np.random.default_rng(5), 30, (0, 20, 0, 20), 0.0)
     found = low_outliers(np.concatenate([ground, [[10.0, 10.0, -3.0]]]))
-    assert found.notes == ("1 of 12,001 points lie below the ground",)
+    assert found.notes == ("1 of 12,001 points lies below the ground",)
     assert halo_m(LowOutliers(ground_window_m=12.0)) == 12.0
 
 
@@ -227,3 +229,17 @@ def test_a_clump_below_the_ground_goes():
     low = is_low(points)
     assert low[: len(clump)].all()
     assert not low[len(clump) :].any()
+
+
+@pytest.mark.parametrize(
+    ("notes", "said"),
+    [
+        (low_notes(1, 3000), "1 of 3,000 points lies below the ground"),
+        (low_notes(2, 3000), "2 of 3,000 points lie below the ground"),
+        (cloth_notes(0, 1, 1), "1 of 1 point is too far from any ground for a height"),
+        (unknown_notes(1), "1 point has no known ground below and was not cropped by height"),
+        (stray_notes(2), "2 points lie far from all others and do not count for the mean"),
+    ],
+)
+def test_one_point_is_not_said_as_many_are(notes, said):
+    assert notes == (said,)

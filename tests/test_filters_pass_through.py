@@ -69,7 +69,7 @@ def test_heights_crop_where_they_are_known():
         np.zeros((4, 3)), PassThrough(margin_below_ground_m=0.4), height_above_ground=height
     )
     assert chosen.is_kept.tolist() == [False, True, True, True]
-    assert "1 points have no known ground" in chosen.notes[0]
+    assert "1 point has no known ground" in chosen.notes[0]
     chosen = pass_through(
         np.zeros((4, 3)), PassThrough(height_m=(0.0, None)), height_above_ground=height
     )

@@ -42,7 +42,7 @@ def test_one_far_point_does_not_blind_it():
     assert not plain.is_kept[-1]
     far = statistical(np.concatenate([points, [[1e6, 1e6, 1e6]]]))
     np.testing.assert_array_equal(far.is_kept, [*plain.is_kept, False])
-    assert "1 points lie far" in far.notes[0]
+    assert "1 point lies far" in far.notes[0]
 
 
 @pytest.mark.parametrize("size", [{}, {"radius_m": 0.5}])

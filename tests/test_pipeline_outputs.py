@@ -11,11 +11,16 @@ import pytest
 from dougong.errors import InputError, OutputError
 from dougong.formats.atomic import replacing
 from dougong.pipeline import outputs
+from dougong.pipeline.result_folder import (
+    refuse_inputs_in_result,
+    refuse_other_result,
+    result_folder,
+)
 
 
 def test_a_folder_appears_only_when_all_of_it_is_there(tmp_path):
     out = tmp_path / "result"
-    with outputs.result_folder(out) as part:
+    with result_folder(out) as part:
         (part / "clouds").mkdir()
         (part / "clouds" / "a.laz").write_bytes(b"1")
         assert not out.exists()
@@ -25,7 +30,7 @@ def test_a_folder_appears_only_when_all_of_it_is_there(tmp_path):
 
 def test_a_failed_job_leaves_no_folder_and_no_part(tmp_path):
     def job():
-        with outputs.result_folder(tmp_path / "result") as part:
+        with result_folder(tmp_path / "result") as part:
             (part / "half").write_text("x")
             raise RuntimeError
 
@@ -39,7 +44,7 @@ def test_writing_into_an_old_folder_keeps_files_of_others(tmp_path):
     out.mkdir()
     (out / "notes.txt").write_text("mine")
     (out / "result.json").write_text("old")
-    with outputs.result_folder(out) as part:
+    with result_folder(out) as part:
         (part / "result.json").write_text("new")
     assert (out / "notes.txt").read_text() == "mine"
     assert (out / "result.json").read_text() == "new"
@@ -48,7 +53,7 @@ def test_writing_into_an_old_folder_keeps_files_of_others(tmp_path):
 def test_cancelling_removes_what_was_begun_and_keeps_what_was_there(tmp_path):
     finished = tmp_path / "a.laz"
     finished.write_text("old")
-    job = outputs.result_folder(tmp_path / "result")
+    job = result_folder(tmp_path / "result")
     part = job.__enter__()
     (part / "half").write_text("x")
     with outputs.watched(finished):
@@ -82,7 +87,7 @@ def test_a_place_that_cannot_be_written_is_one_sentence(tmp_path):
         outputs.write_text(tmp_path / "file" / "a.json", "x")
     with (
         pytest.raises(OutputError, match="cannot be made"),
-        outputs.result_folder(tmp_path / "file" / "out"),
+        result_folder(tmp_path / "file" / "out"),
     ):
         pass
 
@@ -99,12 +104,12 @@ def test_two_jobs_into_one_folder_do_not_mix(tmp_path):
         theirs = part_of_process(tmp_path, other.pid)
         with (
             pytest.raises(OutputError, match=f"another dougong .process {other.pid}"),
-            outputs.result_folder(tmp_path / "result"),
+            result_folder(tmp_path / "result"),
         ):
             pass
         assert theirs.is_dir()
         other.communicate(b"\n")
-    with outputs.result_folder(tmp_path / "result") as part:
+    with result_folder(tmp_path / "result") as part:
         (part / "a").touch()
     assert [path.name for path in tmp_path.iterdir()] == ["result"], "a killed job's rest is gone"
 
@@ -114,7 +119,7 @@ def test_a_job_of_another_machine_is_not_taken_for_dead(tmp_path):
     theirs = part_of_process(tmp_path, 1, host="elsewhere")
     with (
         pytest.raises(OutputError, match=r"on elsewhere.*if it is gone, delete"),
-        outputs.result_folder(tmp_path / "result"),
+        result_folder(tmp_path / "result"),
     ):
         pass
     assert theirs.is_dir()
@@ -169,7 +174,7 @@ def test_a_result_folder_that_is_a_file_is_refused_at_once(tmp_path):
     (tmp_path / "result").touch()
     with (
         pytest.raises(OutputError, match="is a file, and the result is a folder"),
-        outputs.result_folder(tmp_path / "result"),
+        result_folder(tmp_path / "result"),
     ):
         pass
 
@@ -244,14 +249,14 @@ def test_full_clouds_and_distances_of_an_earlier_result_go(tmp_path):
         "full_resolution": {"files": [{"file": "full/st0.laz"}]},
     }
     outputs.write_json(out / "result.json", result)
-    with outputs.result_folder(out) as part:
+    with result_folder(out) as part:
         (part / "result.json").write_text("{}")
     assert sorted(f.name for f in out.rglob("*") if f.is_file()) == ["keep.txt", "result.json"]
 
 
 def test_an_error_names_the_folder_that_the_user_named(tmp_path):
     def job():
-        with outputs.result_folder(tmp_path / "result") as part:
+        with result_folder(tmp_path / "result") as part:
             raise OutputError(f"The disk is full: {part / 'a.laz'} needs 3 MB.")
 
     with pytest.raises(OutputError) as caught:
@@ -265,7 +270,7 @@ def test_clouds_of_an_earlier_result_do_not_stay_beside_the_new_ones(tmp_path):
     out = tmp_path / "result"
 
     def result(*names):
-        with outputs.result_folder(out) as part:
+        with result_folder(out) as part:
             for name in names:
                 for folder, suffix in (("clouds", "laz"), ("registrations", "json")):
                     (part / folder).mkdir(exist_ok=True)
@@ -278,3 +283,114 @@ def test_clouds_of_an_earlier_result_do_not_stay_beside_the_new_ones(tmp_path):
     result("scan")
     found = sorted(str(p.relative_to(out)) for p in out.rglob("*") if p.is_file())
     assert found == ["clouds/mine.txt", "clouds/scan.laz", "registrations/scan.json", "result.json"]
+
+
+def files_in(folder):
+    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+
+
+def test_a_result_is_made_on_the_disk_where_it_ends(tmp_path):
+    """Beside a mount point, and beside a link, is another disk: the last rename failed."""
+    from dougong.pipeline.store import Store
+
+    disk, out = tmp_path / "disk" / "there", tmp_path / "result"
+    disk.mkdir(parents=True)
+    out.symlink_to(disk)
+    with result_folder(out) as part:
+        assert part.parent.samefile(disk)
+        (part / "result.json").write_text("{}")
+    assert files_in(disk) == ["result.json"]
+    assert Store.beside(out).scratch == (tmp_path / "disk" / "there.work").resolve()
+    out.unlink()
+    out.symlink_to(tmp_path / "disk" / "new")
+    with result_folder(out) as part:
+        (part / "a").touch()
+    assert out.is_symlink()
+    assert files_in(tmp_path / "disk") == ["new/a", "there/result.json"]
+
+
+def test_work_of_a_mounted_folder_is_inside_it(tmp_path, monkeypatch):
+    from dougong.pipeline.store import Store
+
+    monkeypatch.setattr("os.path.ismount", lambda path: path == tmp_path)
+    assert Store.beside(tmp_path).scratch.parent == tmp_path
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_a_finished_result_that_cannot_be_moved_stays(tmp_path, monkeypatch, is_there):
+    out = tmp_path / "result"
+    if is_there:
+        out.mkdir()
+    rename = type(out).rename
+
+    def refused(path, target):
+        if ".part-" in str(path.relative_to(tmp_path)) and target.name in ("result", "b"):
+            raise OSError(18, "Invalid cross-device link")
+        return rename(path, target)
+
+    def job():
+        with result_folder(out) as part:
+            (part / "a").touch()
+            (part / "b").write_text("hours of work")
+
+    monkeypatch.setattr(type(out), "rename", refused)
+    monkeypatch.setattr(type(out), "replace", refused)
+    with pytest.raises(OutputError, match=r"cross-device.*result\.finished: move them"):
+        job()
+    monkeypatch.undo()
+    with result_folder(out):
+        pass
+    (kept,) = tmp_path.rglob("b")
+    assert kept.read_text() == "hours of work"
+    assert ".part-" not in str(kept.relative_to(tmp_path))
+
+
+def test_exports_of_an_earlier_pose_do_not_stay_beside_a_new_one(tmp_path):
+    """A wrong pose would be loaded elsewhere, beside a registration that says `failed`."""
+    out = tmp_path / "result"
+    out.mkdir()
+    exports = [
+        f"registration{end}" for end in (".cloudcompare.txt", ".pdal.json", ".metashape.xml")
+    ]
+    for name in (*exports, "distances.laz", "registration.notes.txt"):
+        (out / name).write_text("old")
+    outputs.write_json(out / "registration.json", {"matrix": None})
+    with result_folder(out) as part:
+        outputs.write_json(part / "registration.json", {"matrix": None})
+    assert files_in(out) == ["registration.json", "registration.notes.txt"]
+
+
+def run_of(out, name="scan"):
+    """A folder as a demo leaves it."""
+    for file in ("merged.copc.laz", f"clouds/{name}.laz", f"clouds/{name}.notes.txt", "demo.json",
+                 f"registrations/{name}.pdal.json", "scene/lidar.laz", "report.html"):  # fmt: skip
+        (out / file).parent.mkdir(parents=True, exist_ok=True)
+        (out / file).write_text("old")
+    outputs.write_json(out / "result.json", {"clouds": [{"name": name}]})
+
+
+def test_a_folder_holds_one_result(tmp_path):
+    """A demo's errors against its truth were shown as those of another run."""
+    out = tmp_path / "result"
+    run_of(out)
+    with result_folder(out) as part:
+        outputs.write_json(part / "registration.json", {"matrix": None})
+    assert files_in(out) == ["clouds/scan.notes.txt", "registration.json", "scene/lidar.laz"]
+    with result_folder(out) as part:
+        outputs.write_json(part / "result.json", {"clouds": []})
+    assert files_in(out) == ["clouds/scan.notes.txt", "result.json", "scene/lidar.laz"]
+
+
+@pytest.mark.parametrize("name", ["result.json", "registration.json", "report.html"])
+def test_no_command_writes_over_the_result_of_another(tmp_path, name):
+    (tmp_path / name).touch()
+    with pytest.raises(InputError, match=f"{name} exists already"):
+        refuse_other_result(tmp_path, overwrite=False)
+    refuse_other_result(tmp_path, overwrite=True)
+
+
+def test_a_result_that_is_replaced_is_no_input(tmp_path):
+    run_of(tmp_path)
+    refuse_inputs_in_result([tmp_path / "scene" / "lidar.laz"], tmp_path)
+    with pytest.raises(InputError, match=r"scan\.laz is part of the result in .*that is replaced"):
+        refuse_inputs_in_result([tmp_path / "clouds" / "scan.laz"], tmp_path)

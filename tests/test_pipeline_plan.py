@@ -1,5 +1,6 @@
 """`dougong plan` says what `dougong run` does."""
 
+import inspect
 import json
 import shutil
 
@@ -7,7 +8,8 @@ import laspy
 import numpy as np
 import pytest
 
-from dougong.cli import call
+from dougong.cli import call, plan
+from dougong.cli import run as run_command
 from dougong.cloud import Cloud
 from dougong.formats import write
 from dougong.pipeline import memory
@@ -38,6 +40,20 @@ def test_small_clouds_stay_in_memory(site, capsys):
     assert plan["refusal"] is None
     assert plan["memory_bytes"] == memory.estimated_bytes([30_000, 8_000])
     assert not list(site.glob("*.work"))
+
+
+def test_plan_takes_the_arguments_of_run(site, capsys):
+    taken = inspect.signature(plan.command).parameters
+    assert set(inspect.signature(run_command.command).parameters) <= set(taken)
+    out = site / "result"
+    code, document = planned(site, capsys, "--out", str(out), "--merge", "all")
+    assert (code, document["refusal"]) == (0, None)
+    out.mkdir()
+    (out / "result.json").touch()
+    code, document = planned(site, capsys, "--out", str(out))
+    assert (code, len(document["files"])) == (2, 2)
+    assert "result.json exists already" in document["refusal"]
+    assert planned(site, capsys, "--out", str(out), "--overwrite")[0] == 0
 
 
 def test_a_scan_that_does_not_fit_goes_on_tiles(site, capsys, monkeypatch):

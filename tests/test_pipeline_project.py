@@ -125,6 +125,20 @@ def test_patterns_are_relative_sorted_and_name_each_file_once(tmp_path):
         files_of(Entry(name="s", kind="lidar", files=("scan/*.laz",)), tmp_path)
 
 
+@pytest.mark.parametrize("text", ["", "s**.laz"])
+def test_what_is_no_pattern_is_a_wrong_project(tmp_path, text):
+    with pytest.raises(InputError, match="cloud 's': "):
+        files_of(Entry(name="s", kind="lidar", files=(text,)), tmp_path)
+
+
+def test_a_link_to_a_file_without_a_suffix_is_a_cloud(tmp_path):
+    """Caches of data versions keep files under their hash."""
+    (tmp_path / "1f3a").write_bytes(b"LASF")
+    (tmp_path / "scan.laz").symlink_to("1f3a")
+    (found,) = all_files(from_files([tmp_path / "scan.laz"], []), Path())
+    assert found == tmp_path / "scan.laz"
+
+
 def test_one_file_under_two_names_is_refused(tmp_path):
     (tmp_path / "a.laz").write_bytes(b"LASF")
     (tmp_path / "b.laz").symlink_to("a.laz")

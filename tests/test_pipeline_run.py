@@ -182,6 +182,7 @@ def test_what_was_removed_is_kept_to_be_looked_at(folder, capsys, monkeypatch):
              if name not in ("kept", "decimated")}  # fmt: skip
     removed = dougong.read(folder / "out" / "removed" / "one.laz")
     assert len(removed) == one["removed_shown"] == sum(taken.values()) > 0
+    assert one["removed_by_file"] == [{"removed": len(removed), "shown": len(removed)}]
     codes = removed.attribute("dougong_reason")
     assert {Reason(code).name.lower(): int((codes == code).sum()) for code in set(codes)} == taken
     shown = removed.frame.to_file(removed.xyz)

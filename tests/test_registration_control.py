@@ -11,7 +11,7 @@ from dougong.cli import call
 from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.formats import write
-from dougong.pipeline.control import control_of, quality_document, read_control
+from dougong.pipeline.control import control_of, quality_document, quality_notes, read_control
 from dougong.pipeline.pairs import HEADER
 from dougong.registration import Prepare, Register, register
 from dougong.registration.checks import check_error, level_of, reaches
@@ -414,6 +414,11 @@ def test_quality_needs_every_registration_checked_and_fine_enough():
     assert quality_document("LOA10", both)["is_reached"] is True
     assert quality_document("LOA10", [*both, document("c", None)])["is_reached"] is False
     assert quality_document(None, both)["is_reached"] is None
+    assert quality_document("LOA10", [])["is_reached"] is False, "nothing was registered"
+    assert quality_notes(quality_document(None, both)) == []
+    (said,) = quality_notes(quality_document("LOA20", [*both, document("c", None)]))
+    assert said.endswith("NOT reached: check points of b prove LOA10; no check points tell of c")
+    assert quality_notes(quality_document("LOA20", []))[0].endswith("nothing was registered")
 
 
 @pytest.fixture(scope="module")
@@ -459,10 +464,12 @@ min_spacing_m = 0.2
 
 
 @pytest.mark.parametrize(("level", "code"), [("LOA10", 0), ("LOA50", 3)])
-def test_a_project_says_whether_it_reaches_its_level(survey, tmp_path, level, code):
+def test_a_project_says_whether_it_reaches_its_level(survey, tmp_path, level, code, capsys):
     project = survey / f"{level}.toml"
     project.write_text(PROJECT + f'control = "control.csv"\nrequired_level = "{level}"\n')
     assert call(["run", str(project), "--out", str(tmp_path / "out"), "--quiet"]) == code
+    said = f"note: the required level of accuracy, {level}, is {'NOT ' if code else ''}reached"
+    assert said in capsys.readouterr().out
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["status"] == "ok"
     assert result["quality"]["is_reached"] == (code == 0)

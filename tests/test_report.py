@@ -3,27 +3,30 @@
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from shutil import copyfile
 
 import numpy as np
 import pytest
 
 from dougong.cloud import Cloud
 from dougong.errors import InputError
-from dougong.formats import write
+from dougong.formats import in_system, write
+from dougong.formats.units import as_wkt
 from dougong.pipeline.provenance import sha256
 from dougong.registration.checks import checks_document
 from dougong.registration.control import Control
 from dougong.registration.control_solve import ControlPoints
 from dougong.report import build, rebuild
-from dougong.report.documents import replaced_inputs
+from dougong.report.documents import in_metres, replaced_inputs
 from dougong.report.drawing import View, draw_dots, draw_surface, height_colours, oblique_view
 from dougong.report.figures import find_place, overview, slices
-from dougong.report.layers import BLUE, COLOURS, Layer, rigid_inverse
+from dougong.report.layers import BLUE, COLOURS, Layer, pair_layers, rigid_inverse, run_layers
 from dougong.report.links import network_rows
 from dougong.report.model import flat, from_registration, from_run
 from dougong.report.plates import length_text, line_chart, plate, round_length
 from dougong.report.render import environment, render
 from dougong.report.streaming import items_of
+from dougong.report.verdict import NO_CHECKS, accuracy
 
 TOP = View(
     right=np.array([1.0, 0, 0]),
@@ -409,6 +412,63 @@ def test_going_back_through_a_matrix_is_exact_at_map_coordinates():
     np.testing.assert_allclose(target @ back.T + shift, own, atol=1e-8)
 
 
+US_FOOT = 1200 / 3937
+
+
+@pytest.fixture
+def in_feet(tmp_path):
+    """A scan in metres and the same points in a map of feet, with the matrix between the files."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]) / US_FOOT
+    matrix[:3, 3] = [6_000_000.0, 2_000_000.0, 100.0]
+    own = building(0)
+    there = own @ matrix[:3, :3].T + matrix[:3, 3]
+    files = [tmp_path / "scan.laz", tmp_path / "drone.laz", tmp_path / "bare.laz"]
+    write(Cloud.from_points(own), files[0])
+    write(in_system(Cloud.from_points(there), "EPSG:2227"), files[1])
+    write(Cloud.from_points(there), files[2])
+    frames = {
+        "source_frame": {"crs_wkt": None, "unit_m": [1.0, 1.0, 1.0]},
+        "target_frame": {"crs_wkt": as_wkt("EPSG:2227"), "unit_m": [US_FOOT] * 3},
+    }
+    inputs = [{"path": str(path), "sha256": "", "points": len(own)} for path in files]
+    poses = [{"matrix": matrix.tolist(), "score": 0.8, "yaw_deg": 37.0}]
+    document = registration(
+        matrix=matrix.tolist(),
+        coarse={"method": "plan", "hypotheses": poses, "margin": 0.5},
+        **frames,
+    )
+    return document, inputs, own
+
+
+@pytest.mark.parametrize("target", [1, 2], ids=["named by the file", "named by the user"])
+def test_a_pair_in_feet_is_drawn_in_metres(in_feet, target):
+    """Its matrix leads to feet and the clouds are drawn in metres: both lay far from each other."""
+    document, inputs, own = in_feet
+    drawn = in_metres(document | {"inputs": [inputs[0], inputs[target]]})
+    source, reference = pair_layers(drawn)
+    np.testing.assert_allclose(source.after, reference.after, atol=0.001)
+    np.testing.assert_allclose(np.ptp(reference.after[:, 2]), np.ptp(own[:, 2]), atol=0.001)
+    pose = np.array(drawn["coarse"]["hypotheses"][0]["matrix"])
+    np.testing.assert_allclose(np.linalg.det(pose[:3, :3]), 1.0)
+
+
+@pytest.mark.parametrize("is_sure", [True, False])
+def test_a_run_in_feet_is_drawn_in_metres(in_feet, tmp_path, is_sure):
+    document, inputs, own = in_feet
+    (tmp_path / "clouds").mkdir()
+    copyfile(inputs[1]["path"], tmp_path / "clouds" / "drone.laz")
+    copyfile(inputs[1 if is_sure else 0]["path"], tmp_path / "clouds" / "scan.laz")
+    result = run_result(document) | {
+        "clouds": [{"name": name, "points_out": len(own)} for name in ("drone", "scan")],
+        "merged": {"clouds": ["drone", "scan"] if is_sure else ["drone"]},
+    }
+    source, reference = run_layers(tmp_path, in_metres(result))
+    np.testing.assert_allclose(source.after, reference.after, atol=0.001)
+    centred = own - own.mean(axis=0)
+    np.testing.assert_allclose(source.before - source.before.mean(axis=0), centred, atol=0.001)
+
+
 @pytest.mark.parametrize(
     ("metres", "bar", "text"),
     [(23.0, 20.0, "20 m"), (0.7, 0.5, "50 cm"), (1.0, 1.0, "1 m"), (0.0061, 0.005, "5 mm")],
@@ -482,6 +542,17 @@ def test_the_certificate_states_no_grade_without_check_points():
     words, html = certificate(surveyed(checks=0))
     assert "none is stated: no check points were held out" in words
     assert not re.search(r"LOA\d0 \(USIBD\)", html)
+
+
+def test_check_points_that_could_not_be_used_are_told_from_none():
+    """A failed registration was said to have been given no check points."""
+    unused = registration("failed", checks=surveyed(checks=8) | {"check": None, "level": None})
+    missed = {"required_level": "LOA20", "is_reached": False}
+    given, required = accuracy([unused], missed)
+    assert given.startswith("scan: 8 check points had no pose to be measured at")
+    assert required == "The required level, LOA20, is NOT reached."
+    assert accuracy([registration()], missed) == (NO_CHECKS, required)
+    assert "lie" in accuracy([registration(checks=surveyed(checks=8))], None)[0]
 
 
 def test_the_certificate_says_what_a_searched_scale_is_worth():

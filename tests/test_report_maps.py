@@ -5,6 +5,8 @@ import re
 import numpy as np
 import pytest
 
+from dougong.cloud import Cloud
+from dougong.formats import write_merged
 from dougong.report.coverage import coverage
 from dougong.report.figures import find_place
 from dougong.report.layers import BLUE, COLOURS, Layer
@@ -20,7 +22,7 @@ from dougong.report.maps import (
     signs,
 )
 from dougong.report.poses import rival_poses, score_chart
-from dougong.report.removal import surface_m2
+from dougong.report.removal import removals, surface_m2
 
 # Machado, Oliveira and Fernandes 2009, severity 1.0, linear RGB.
 EYES = {
@@ -185,3 +187,31 @@ def test_surface_is_counted_in_square_metres():
     layer = Layer(name="a", colour=BLUE, after=wall(0, 10, 0.125, 0, 50_000), before=None,
                   is_reference=True, is_sure=True)  # fmt: skip
     assert surface_m2(layer) == pytest.approx(40.0, rel=0.12)
+
+
+def test_the_map_of_removed_points_weighs_each_file_by_its_own_sample(tmp_path, monkeypatch):
+    """Each file's sample ends at the same number of points, however many were taken out of it."""
+    rng = np.random.default_rng(0)
+    low, high = (rng.uniform([x, 1, 0], [x + 0.4, 1.4, 2], (100, 3)) for x in (1.0, 8.0))
+    (tmp_path / "removed").mkdir()
+    files = [Cloud.from_points(points) for points in (low, high)]
+    write_merged(files, tmp_path / "removed" / "scan.laz", source_ids=[1, 1])
+    layer = Layer(
+        name="scan", colour=BLUE, after=rng.uniform([0, 0, 0], [10, 3, 0], (4000, 3)),
+        before=np.zeros((0, 3)), is_reference=False, is_sure=True, origin=np.zeros(3),
+    )  # fmt: skip
+    drawn = []
+    monkeypatch.setattr(
+        "dougong.report.removal.amount_colours",
+        lambda amount, limit: drawn.append(amount) or amount_colours(amount, limit),
+    )
+    taken = {"name": "scan", "reasons": {"kept": 4000, "statistical": 1200}, "points_in": 5200}
+    by_file = [{"removed": 1000, "shown": 100}, {"removed": 0, "shown": 0},
+               {"removed": 200, "shown": 100}]  # fmt: skip
+    for cloud, ratio in ((taken | {"removed_by_file": by_file}, 5.0), (taken, 1.0)):
+        removals(tmp_path, {"clouds": [cloud]}, [layer])
+        sheet = lay_sheet(layer.after, np.eye(3)[0], np.eye(3)[1], 0.5, most=220)
+        amount = np.array(drawn.pop()).reshape(sheet.rows, sheet.columns)
+        half = sheet.columns // 2
+        assert amount[:, :half].sum() / amount[:, half:].sum() == pytest.approx(ratio)
+        assert amount.sum() * sheet.cell_m**2 == pytest.approx(1200)

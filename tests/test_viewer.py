@@ -318,6 +318,27 @@ def test_the_page_saves_its_pairs_in_the_named_file(taking):
     assert len(file.read_text().splitlines()) == 2, "the file is replaced"
 
 
+def test_saving_pairs_keeps_the_rows_that_the_page_does_not_show(tmp_path):
+    """Check points, those of other clouds and every sigma_m were deleted."""
+    file = tmp_path / "control.csv"
+    rows = [
+        "name,cloud,source_x,source_y,source_z,target_x,target_y,target_z,sigma_m,role,seen",
+        "T1,scan,1,2,3.00001,4,5,6,0.003,control,by A",
+        ",,1,7,3,4,5,6,0.002,,",
+        "T2,scan,1,2,9,4,5,6,0.003,check,",
+        "T3,scan2,7,2,3,4,5,6,0.004,control,",
+    ]
+    file.write_text("\n".join(rows) + "\n")
+    told, takes = picking(tmp_path / "scan.laz", tmp_path / "drone.laz", file)
+    takes["pairs"]({"pairs": told["list"]})
+    rows[2] = rows[2].replace(",,1", "2,,1", 1)
+    assert file.read_text().splitlines() == rows
+    moved = told["list"][0] | {"source": [1.0, 2.0, 3.1]}
+    takes["pairs"]({"pairs": [moved]})
+    added = "T1,scan,1.0000,2.0000,3.1000,4.0000,5.0000,6.0000,,control,"
+    assert file.read_text().splitlines() == [rows[0], rows[3], rows[4], added]
+
+
 @pytest.mark.parametrize(
     ("headers", "path", "status"),
     [

@@ -220,11 +220,16 @@ def register_files(
     crs : pair of str, optional
         Reference systems of a source and a target whose files name none.
     """
-    from dougong.pipeline.outputs import refuse_existing, result_folder
     from dougong.pipeline.registering_files import register_files as verb
+    from dougong.pipeline.result_folder import (
+        refuse_inputs_in_result,
+        refuse_other_result,
+        result_folder,
+    )
 
     out = _named(out)
-    refuse_existing([out / "registration.json"], overwrite)
+    refuse_other_result(out, overwrite)
+    refuse_inputs_in_result([source, target], out)
     _say_if_cold(progress)
     with result_folder(out) as part:
         document = verb(
@@ -262,16 +267,16 @@ def run_project(
     `merge`, "best" or "all", takes the place of the project's ``merge.mode``.
     """
     from dougong.pipeline.memory import Room
-    from dougong.pipeline.outputs import refuse_existing, result_folder
-    from dougong.pipeline.project import all_files, asked_project, refuse_own_result
+    from dougong.pipeline.project import all_files, asked_project
     from dougong.pipeline.refusals import refuse_full_disk, refuse_or_announce
+    from dougong.pipeline.result_folder import refuse_other_result, result_folder
     from dougong.pipeline.run import run
 
     out = _named(out)
-    refuse_existing([out / "result.json"], overwrite)
+    refuse_other_result(out, overwrite)
     asked, folder = asked_project(project, lidar, photogrammetry, full_resolution, merge)
     files = all_files(asked, folder)
-    refuse_own_result(files, out)
+    _refuse_result_as_input(files, out)
     if asked.project.full_resolution:
         refuse_full_disk(files, out)
     _say_if_cold(progress)
@@ -284,24 +289,47 @@ def run_project(
     return document
 
 
+def _refuse_result_as_input(files: Sequence[Path], out: Path) -> None:
+    """Refuse files of an earlier result in `out`."""
+    from dougong.pipeline.project import refuse_own_result
+    from dougong.pipeline.result_folder import refuse_inputs_in_result
+
+    refuse_own_result(files, out)
+    refuse_inputs_in_result(files, out)
+
+
 def plan(
     project: Path | None,
+    out: Path | None = None,
     *,
     lidar: Sequence[Path],
     photogrammetry: Sequence[Path],
     full_resolution: bool,
+    merge: str | None,
+    overwrite: bool,
     memory_bytes: int | None,
     progress: Progress,
 ) -> Document:
-    """Return what `run_project` would do: ways, memory, disk, time (see `pipeline.plan.Plan`)."""
+    """Return what `run_project` would do: ways, memory, disk, time (see `pipeline.plan.Plan`).
+
+    With `out` None it is not asked whether a result is there already.
+    """
     from dougong.pipeline.memory import Room
     from dougong.pipeline.plan import plan_run
     from dougong.pipeline.project import all_files, asked_project
+    from dougong.pipeline.result_folder import refuse_other_result
 
-    asked, folder = asked_project(project, lidar, photogrammetry, full_resolution)
-    all_files(asked, folder)
+    asked, folder = asked_project(project, lidar, photogrammetry, full_resolution, merge)
+    files = all_files(asked, folder)
     progress.stage("counting points")
-    return plan_run(asked, folder, Room.of(memory_bytes)).document()
+    document = plan_run(asked, folder, Room.of(memory_bytes)).document()
+    if out is not None and document["refusal"] is None:
+        try:
+            refuse_other_result(_named(out), overwrite)
+            _refuse_result_as_input(files, _named(out))
+        except InputError as error:
+            document["refusal"] = str(error)
+    return document
 
 
 def demo(
@@ -327,10 +355,10 @@ def demo(
     size : "normal" or "small"
     """
     from dougong.evaluation.demo import free_folder, refuse_too_large_demo, run_demo
-    from dougong.pipeline.outputs import refuse_existing, result_folder
+    from dougong.pipeline.result_folder import refuse_other_result, result_folder
 
     folder = free_folder(scene) if out is None else _named(out)
-    refuse_existing([folder / "result.json"], overwrite)
+    refuse_other_result(folder, overwrite)
     refuse_too_large_demo(size, memory_bytes)
     _say_if_cold(progress)
     store = _store(folder, work)

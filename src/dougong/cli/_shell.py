@@ -68,7 +68,7 @@ def execute(common: Common, work: Callable[[Listener], Answer], kept: str = "") 
     progress.close()
     text = answer.text
     if common.json:
-        text = json.dumps(answer.document, indent=2, allow_nan=False, ensure_ascii=False)
+        text = _as_json(answer.document)
     return answer.exit_code if _print(text) else FAILED
 
 
@@ -79,7 +79,7 @@ def fail(error: BaseException, *, as_json: bool, debug: bool) -> int:
     name, message, code = _described(error)
     if as_json:
         document = {"error": {"type": name, "message": message, "exit_code": code}}
-        _print(json.dumps(document, indent=2, ensure_ascii=False))
+        _print(_as_json(document))
     else:
         _say(f"error: {message}\n")
     return code
@@ -150,10 +150,15 @@ def _cancelled(common: Common, kept: str, code: int) -> int:
     message = f"cancelled. {kept or 'Nothing was written.'}"
     if common.json:
         error = {"type": "Cancelled", "message": message, "exit_code": code}
-        _print(json.dumps({"error": error}, indent=2))
+        _print(_as_json({"error": error}))
     else:
         _say(message + "\n")
     return code
+
+
+def _as_json(document: Any) -> str:
+    """Return a document as JSON in ASCII: whatever stdout's encoding is, it arrives whole."""
+    return json.dumps(document, indent=2, allow_nan=False)
 
 
 def _print(text: str) -> bool:

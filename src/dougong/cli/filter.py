@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from dougong import app
+from dougong._words import counted
 from dougong.cli import _text
 from dougong.cli._common import DEFAULT, Common
 from dougong.cli._shell import Answer, Listener, execute
@@ -70,11 +71,17 @@ def command(
         )
         return Answer(document=document, text=text)
 
-    return execute(common, work)
+    kept = ""
+    if common.work is not None:
+        kept = (
+            f"Finished tiles of a cloud larger than memory are kept in {common.work}; run it again "
+            "to go on."
+        )
+    return execute(common, work, kept)
 
 
 def _written(document: dict[str, Any]) -> str:
-    points = f"{_text.count(document['points_written'])} points"
+    points = counted(document["points_written"])
     reduction = f"reduction {_text.percent(document['reduction'])}"
     if not document["is_marked"]:
         return f"{points}, {reduction}"

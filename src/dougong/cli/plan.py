@@ -1,7 +1,7 @@
 """``dougong plan``: what a run would do."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -14,9 +14,12 @@ from dougong.cli._shell import DONE, USAGE, Answer, Listener, execute
 def command(
     project: Path | None = None,
     *,
+    out: Path | None = None,
     lidar: Annotated[list[Path] | None, Parameter(negative="")] = None,
     photogrammetry: Annotated[list[Path] | None, Parameter(negative="")] = None,
     full_resolution: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    merge: Literal["best", "all"] | None = None,
+    overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     common: Common = DEFAULT,
 ) -> int:
     """Say what `dougong run` would do with the same arguments: tiles, memory, disk, time.
@@ -29,20 +32,29 @@ def command(
     ----------
     project
         Project file; `dougong init DIR` writes one.
+    out
+        Folder for the result: says whether the run would be refused for what is in it.
     lidar
         A laser scan; may be given several times.
     photogrammetry
         A drone cloud; may be given several times.
     full_resolution
         Count in that every input file is written again, undecimated.
+    merge
+        As of run: best or all.
+    overwrite
+        A result that exists already would be replaced.
     """
 
     def work(progress: Listener) -> Answer:
         document = app.plan(
             project,
+            out,
             lidar=lidar or (),
             photogrammetry=photogrammetry or (),
             full_resolution=full_resolution,
+            merge=merge,
+            overwrite=overwrite,
             memory_bytes=common.memory_bytes(),
             progress=progress,
         )

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from dougong import app
+from dougong._words import counted
 from dougong.cli import _text
 from dougong.cli._common import DEFAULT, Common
 from dougong.cli._shell import DONE, UNSURE, Answer, Listener, execute
@@ -80,14 +81,14 @@ def _words(document: dict[str, Any], out: Path) -> str:
     merged = document["merged"]
     spent = f"{document['seconds']['total']:.1f} s"
     parts.append(
-        f"merged {_text.count(merged['points'])} points of {', '.join(merged['clouds'])}"
+        f"merged {counted(merged['points'])} of {', '.join(merged['clouds'])}"
         f"{_left_out(merged)} in {spent}; report: {out / 'report.html'}"
     )
     full = document["full_resolution"]
     if full is not None:
         points = sum(file["points"] for file in full["files"])
         parts.append(
-            f"full resolution: {_text.count(points)} points in {len(full['files'])} files in "
+            f"full resolution: {counted(points)} in {counted(len(full['files']), 'file')} in "
             f"{out / 'full'}"
         )
     return _text.join(*parts, _text.notes(document["notes"]))

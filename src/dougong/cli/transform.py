@@ -6,6 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from dougong import app
+from dougong._words import counted
 from dougong.cli import _text
 from dougong.cli._common import DEFAULT, Common
 from dougong.cli._shell import Answer, Listener, execute
@@ -50,7 +51,7 @@ def command(
             memory_bytes=common.memory_bytes(),
             progress=progress,
         )
-        text = f"wrote {output}: {_text.count(document['points'])} points"
+        text = f"wrote {output}: {counted(document['points'])}"
         return Answer(document=document, text=_text.join(text, _text.notes(document["notes"])))
 
     return execute(common, work)

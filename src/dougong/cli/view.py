@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dougong import app
+from dougong._words import counted
 from dougong.cli import _text
 from dougong.cli._common import DEFAULT, Common
 from dougong.cli._shell import DONE, Answer, Listener, execute
+from dougong.cli._signals import Terminated, code_of
 
 if TYPE_CHECKING:
     from dougong.app import Viewing
@@ -61,7 +63,7 @@ def command(
         )
         opened.append(viewing)
         document = viewing.document
-        lines = [f"{', '.join(document['clouds'])}: {_text.count(document['points'])} points"]
+        lines = [f"{', '.join(document['clouds'])}: {counted(document['points'])}"]
         if browser and not document["is_browser_open"]:
             lines.append("NO BROWSER COULD BE OPENED here; open this address yourself:")
         lines.append(document["url"])
@@ -75,9 +77,9 @@ def command(
         if code == DONE:
             sys.stdout.flush()
             threading.Event().wait()
-    except KeyboardInterrupt:
-        # This is how a viewer is closed: nothing has failed.
-        return DONE
+    except KeyboardInterrupt as ended:
+        # Ctrl-C is how a viewer is closed: nothing has failed.
+        return code_of(ended) if isinstance(ended, Terminated) else DONE
     finally:
         for viewing in opened:
             viewing.close()

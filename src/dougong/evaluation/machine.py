@@ -47,12 +47,15 @@ def version_of(package: str) -> str:
 
 
 def code_hash(rooms: Iterable[str]) -> str:
-    """Return the hash of our own source in `rooms`: what a measurement depends on."""
+    """Return the hash of our own source in `rooms` and beside them: what a measurement depends on.
+
+    What lies beside the rooms (threads, sorting, clouds) is of use in all of them.
+    """
     digest = hashlib.sha256()
     package = Path(dougong.__file__).parent
-    for room in rooms:
-        for path in sorted((package / room).rglob("*.py")):
-            digest.update(path.read_bytes())
+    beside = sorted(package.glob("*.py"))
+    for path in [*beside, *(p for room in rooms for p in sorted((package / room).rglob("*.py")))]:
+        digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 

@@ -15,6 +15,7 @@ from pydantic import Field
 from scipy.ndimage import distance_transform_edt
 
 from dougong._checks import as_points
+from dougong._words import of_all
 from dougong.errors import InputError
 from dougong.filters.extent import plan_box_of
 from dougong.filters.low_outliers import LowOutliers, find_levels, is_low_outlier, low_notes
@@ -168,7 +169,8 @@ def cloth_notes(low: int, lost: int, points: int) -> tuple[str, ...]:
     """Return what is to be said where of all `points` so many are low, and without a height."""
     notes = low_notes(low, points)
     if lost:
-        notes += (f"{lost:,} of {points:,} points are too far from any ground for a height",)
+        said = of_all(lost, points, "is", "are")
+        notes += (f"{said} too far from any ground for a height",)
     return notes
 
 

@@ -12,6 +12,7 @@ from pydantic import Field
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from dougong._checks import as_points
+from dougong._words import of_all
 from dougong.errors import InputError
 from dougong.filters.extent import plan_box_of
 from dougong.filters.ranks import median
@@ -131,7 +132,7 @@ def low_outliers(points: Points, params: LowOutliers | None = None) -> Selection
 
 def low_notes(low: int, points: int) -> tuple[str, ...]:
     """Return what is to be said where `low` of all `points` are low outliers."""
-    return (f"{low:,} of {points:,} points lie below the ground",) if low else ()
+    return (f"{of_all(low, points, 'lies', 'lie')} below the ground",) if low else ()
 
 
 def find_levels(blocks: Blocks, points: int, params: LowOutliers) -> Levels:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
 from dougong._checks import as_points
+from dougong._words import counted
 from dougong.errors import InputError
 from dougong.filters.ranks import ValueBlocks, at_rank, count_finite
 from dougong.filters.selection import Selection
@@ -217,7 +218,8 @@ def pass_through(
 
 def unknown_notes(unknown: int) -> tuple[str, ...]:
     """Return what is to be said of so many points without a height."""
-    note = f"{unknown} points have no known ground below and were not cropped by height"
+    have, were = ("has", "was") if unknown == 1 else ("have", "were")
+    note = f"{counted(unknown)} {have} no known ground below and {were} not cropped by height"
     return (note,) if unknown else ()
 
 

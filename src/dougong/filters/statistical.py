@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from dougong._checks import as_points
+from dougong._words import counted
 from dougong.filters.lost_places import EDGE_M, Taken, lost_cells
 from dougong.filters.ranks import ValueBlocks, at_rank, count_finite
 from dougong.filters.selection import Selection
@@ -258,5 +259,6 @@ def spared_notes(spared: int, beyond: int) -> tuple[str, ...]:
 
 def stray_notes(strays: int) -> tuple[str, ...]:
     """Return what is to be said of so many strays."""
-    note = f"{strays} points lie far from all others and do not count for the mean"
+    lie, do = ("lies", "does") if strays == 1 else ("lie", "do")
+    note = f"{counted(strays)} {lie} far from all others and {do} not count for the mean"
     return (note,) if strays else ()

@@ -207,5 +207,28 @@ def quality_document(
         "levels": levels,
         "unchecked": unchecked,
         "below_required": short,
-        "is_reached": None if required is None else not short and not unchecked,
+        "is_reached": None if required is None else bool(levels) and not short and not unchecked,
     }
+
+
+def quality_notes(quality: Mapping[str, Any]) -> list[str]:
+    """Return in one sentence whether the level that a project requires is reached, and why not.
+
+    Parameters
+    ----------
+    quality : mapping
+        As `quality_document` returns it.
+    """
+    required = quality["required_level"]
+    if required is None:
+        return []
+    if quality["is_reached"]:
+        return [f"the required level of accuracy, {required}, is reached"]
+    levels = quality["levels"]
+    why = [
+        f"check points of {name} prove {levels[name] or 'none'}"
+        for name in quality["below_required"]
+    ]
+    why += [f"no check points tell of {name}" for name in quality["unchecked"]]
+    told = "; ".join(why) or "nothing was registered"
+    return [f"the required level of accuracy, {required}, is NOT reached: {told}"]

@@ -22,6 +22,7 @@ from dougong.pipeline.outputs import write_json, write_text
 from dougong.typing import Transform
 
 CLOUDCOMPARE, PDAL, METASHAPE = ".cloudcompare.txt", ".pdal.json", ".metashape.xml"
+SUFFIXES = (CLOUDCOMPARE, PDAL, METASHAPE)
 _LARGE = 1e4
 """CloudCompare holds coordinates as float32: larger ones it shifts, and so do we."""
 _LOCAL_CS = (

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from dougong._words import counted
 from dougong.errors import DougongError, InputError
 from dougong.formats import SUFFIXES, FileInfo, describe, iterate
 from dougong.formats.stream import stem_of
@@ -185,7 +186,7 @@ def project_text(title: str, guesses: list[Guess], skipped: list[str]) -> str:
             "[[cloud]]",
             f"name = {_quoted(guess.name)}",
             f'kind = "{guess.kind}"   # guessed: {guess.why}',
-            f"files = [{_quoted(guess.file.as_posix())}]   # {guess.points:,} points; "
+            f"files = [{_quoted(guess.file.as_posix())}]   # {counted(guess.points)}; "
             "patterns such as *.laz work too",
         ]
         if guess.stations > 1:

@@ -21,9 +21,11 @@ import numpy as np
 from dougong._sorting import distinct
 from dougong.cloud import Cloud, Frame
 from dougong.errors import RegistrationError
+from dougong.pipeline.control import control_of
 from dougong.pipeline.links import Linked, register_pair
 from dougong.pipeline.movers import Mover, ReducedClouds
 from dougong.pipeline.progress import Progress
+from dougong.pipeline.registering import impossible
 from dougong.registration import Register
 from dougong.registration.control_solve import ControlPoints
 from dougong.registration.network import Joined, PairLink, is_adjustable, join, local_matrix
@@ -79,6 +81,7 @@ class _Search:
             There are two clouds, and no pose can even be looked for.
         """
         known = self.tried.get((source, target))
+        control = self.control if target == self.reference else {}
         if known is None:
             try:
                 known = register_pair(
@@ -86,32 +89,19 @@ class _Search:
                     self.movers[target],
                     (self.cloud(source), self.cloud(target)),
                     self.params,
-                    self.control if target == self.reference else {},
+                    control,
                     self.progress,
                 )
             except RegistrationError as error:
                 if len(self.movers) == 2:
                     raise
                 self.progress.note(f"{source} -> {target} is failed: {error}")
-                known = self._impossible(error)
+                # One of many: the others go on.
+                self.errors.append(error)
+                surveyed = control_of(control, source, self.movers[source].entry)
+                known = impossible(error, self.params, surveyed)
             self.tried[source, target] = known
         return known
-
-    def _impossible(self, error: RegistrationError) -> Registration:
-        """Return the answer for a pair whose search cannot start: one of many, so others go on."""
-        self.errors.append(error)
-        return Registration(
-            status="failed",
-            matrix=None,
-            reason=str(error),
-            probability=0.0,
-            scale=1.0,
-            dof=self.params.dof if isinstance(self.params.dof, int) else 6,
-            coarse_method=self.params.coarse,
-            hypotheses=(),
-            margin=0.0,
-            fine=None,
-        )
 
     def is_tried(self, one: str, other: str) -> bool:
         """Say whether a pair was registered, either way round."""

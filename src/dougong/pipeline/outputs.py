@@ -17,18 +17,17 @@ from dougong.formats.registry import family_of
 from dougong.formats.unfinished import (
     clear_left,
     clear_parts,
-    is_another_at_it,
-    marked,
     own_mark,
     part_of,
 )
 
-_unfinished: set[Path] = set()
+UNFINISHED: set[Path] = set()
+"""What is being written, and is removed when the process ends at once."""
 
 
 def remove_unfinished() -> None:
     """Remove what was being written. Called when the process is about to end at once."""
-    for path in list(_unfinished):
+    for path in list(UNFINISHED):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:
@@ -75,6 +74,11 @@ def refuse_output(input: Path, output: Path, files: Sequence[Path], overwrite: b
 
 _OURS = ".dougong-scratch"
 """The file that marks a folder as one that we made, and may delete."""
+
+
+def behind_link(out: Path) -> Path:
+    """Return where `out` lies itself, so that what is made beside it is on its disk."""
+    return out.resolve() if out.is_symlink() else out
 
 
 def claim_folder(folder: Path) -> None:
@@ -183,12 +187,18 @@ def write_json(path: Path, document: Any) -> None:
 @contextmanager
 def watched(*paths: Path) -> Iterator[None]:
     """Have the unfinished forms of `paths` removed should the block be cancelled."""
-    parts = [part_of(path) for path in paths]
-    _unfinished.update(parts)
+    with removed_if_cancelled(*(part_of(path) for path in paths)):
+        yield
+
+
+@contextmanager
+def removed_if_cancelled(*paths: Path) -> Iterator[None]:
+    """Have `paths` removed should the block be cancelled; else they are the caller's to remove."""
+    UNFINISHED.update(paths)
     try:
         yield
     finally:
-        _unfinished.difference_update(parts)
+        UNFINISHED.difference_update(paths)
 
 
 @contextmanager
@@ -201,104 +211,8 @@ def passing_folder(head: Path) -> Iterator[Path]:
     clear_left(head)
     # Our own number from an earlier life: containers count from 1 each time.
     shutil.rmtree(folder, ignore_errors=True)
-    _unfinished.add(folder)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        _unfinished.discard(folder)
-
-
-def _refuse_second_writer(out: Path) -> None:
-    """Refuse a folder that another process writes to; clear what a killed one left.
-
-    Raises
-    ------
-    OutputError
-        Another process is at it, or may be (on another machine).
-    """
-    if os.name != "posix":
-        return
-    for old, mark in marked(out.with_name(f".{out.name}.part-")):
-        # Our own number from an earlier life (containers count from 1 each time) is stale too.
-        if old not in _unfinished and not is_another_at_it(mark):
-            shutil.rmtree(old, ignore_errors=True)
-            continue
-        host, _, process = mark.rpartition("-")
-        msg = (
-            f"{out} is being written by another dougong (process {process} on {host or 'a host'}). "
-            f"Wait for it or choose another --out; if it is gone, delete {old}."
-        )
-        raise OutputError(msg)
-
-
-@contextmanager
-def result_folder(out: Path) -> Iterator[Path]:
-    """Yield an empty folder beside `out`; its files move into `out` when the block succeeds.
-
-    Clouds and registrations of an earlier result in `out` go, since beside the new ones they would
-    pass for a part of it; other files that the job does not write stay as they are. On any failure
-    the folder is removed and `out` is untouched.
-
-    Raises
-    ------
-    OutputError
-        The folder cannot be made, or another process is writing to `out`.
-    """
-    part = out.with_name(f".{out.name}.part-{own_mark()}")
-    if out.exists() and not out.is_dir():
-        msg = f"{out} is a file, and the result is a folder. Choose another --out."
-        raise OutputError(msg)
-    _refuse_second_writer(out)
-    try:
-        part.mkdir(parents=True)
-    except OSError as error:
-        msg = f"{out} cannot be made: {error.strerror or error}. Choose another --out."
-        raise OutputError(msg) from error
-    _unfinished.add(part)
-    try:
-        yield part
-        _move_into(part, out)
-    except OutputError as error:
-        # The user named `out`; where its files are made first is our own affair.
-        raise OutputError(str(error).replace(str(part), str(out))) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-        _unfinished.discard(part)
-
-
-def _move_into(part: Path, out: Path) -> None:
-    """Move a finished folder into place: by one rename where `out` is not there yet."""
-    try:
-        if not out.exists():
-            part.rename(out)
-            return
-        old = _clouds_of_earlier_result(out)
-        for file in sorted(path for path in part.rglob("*") if path.is_file()):
-            target = out / file.relative_to(part)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            file.replace(target)
-            old.discard(target)
-        for file in old:
-            file.unlink()
-    except OSError as error:
-        msg = f"{out} could not be written: {error.strerror or error}."
-        raise OutputError(msg) from error
-
-
-_OF_CLOUDS = ("clouds", "registrations", "removed", "distances")
-"""Folders of a result that hold files named after its clouds."""
-
-
-def _clouds_of_earlier_result(out: Path) -> set[Path]:
-    """Return the files in `out` that the result.json there calls its clouds' own."""
-    try:
-        result = json.loads((out / "result.json").read_text(encoding="utf-8"))
-        starts = tuple(f"{cloud['name']}." for cloud in result["clouds"])
-        again = (result.get("full_resolution") or {}).get("files", [])
-        full = {out / f"{file['file']}{books}" for file in again for books in ("", ".json")}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return set()  # no result, or none of ours: nothing in the folder is known
-    files = (path for folder in _OF_CLOUDS for path in (out / folder).glob("*"))
-    named = {path for path in files if path.name.startswith(starts)}
-    return {path for path in named | full if path.is_file() and path.is_relative_to(out)}
+    with removed_if_cancelled(folder):
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)

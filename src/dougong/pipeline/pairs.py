@@ -20,6 +20,8 @@ COORDINATES = ("source_x", "source_y", "source_z", "target_x", "target_y", "targ
 HEADER = ("name", "cloud", *COORDINATES, "sigma_m", "role")
 """The header of control files: `cloud` is the source, `role` is control (used) or check (not)."""
 _NUMBERS = (*COORDINATES, "sigma_m")
+_STEP = 1e-4
+"""Coordinates are written to this."""
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -41,6 +43,9 @@ class PickedSet(Parameters):
 def write_pairs(path: Path, cloud: str, pairs: Sequence[PickedPair]) -> None:
     """Write pairs as a control file, to a tenth of a millimetre where units are metres.
 
+    Rows that `read_pairs` leaves out (of other clouds, of role check) stay as they are, and so do
+    those of pairs that were not moved, with their sigma_m.
+
     Parameters
     ----------
     path : Path
@@ -48,14 +53,41 @@ def write_pairs(path: Path, cloud: str, pairs: Sequence[PickedPair]) -> None:
     cloud : str
         Name of the source.
     pairs : sequence of PickedPair
+
+    Raises
+    ------
+    InputError
+        The file that exists is not one of pairs.
     """
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(HEADER)
-    for pair in pairs:
+    new = list(pairs)
+    rows: list[dict[str, str]] = []
+    for number, row in enumerate(csv_rows(path) if path.exists() else [], 2):
+        if not (_is_of(row, cloud) and _is_used(row)):
+            rows.append(row)
+            continue
+        at = coordinates_in(path, number, row)
+        same = next((p for p in new if np.allclose((*p.source, *p.target), at, 0.0, _STEP)), None)
+        if same is not None:
+            new.remove(same)
+            rows.append(row | {"name": same.name})
+    for pair in new:
         places = [f"{value:.4f}" for value in (*pair.source, *pair.target)]
-        rows.writerow([pair.name, cloud, *places, "", "control"])
+        known = {"name": pair.name, "cloud": cloud, "sigma_m": "", "role": "control"}
+        rows.append(known | dict(zip(COORDINATES, places, strict=True)))
+    text = io.StringIO()
+    columns = dict.fromkeys((*HEADER, *(name for row in rows for name in row)))
+    table = csv.DictWriter(text, list(columns), lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
     write_text(path, text.getvalue())
+
+
+def _is_of(row: dict[str, str], cloud: str) -> bool:
+    return (row.get("cloud") or cloud) == cloud
+
+
+def _is_used(row: dict[str, str]) -> bool:
+    return (row.get("role") or "control").strip().lower() != "check"
 
 
 def read_pairs(path: Path, source: str) -> PickedPairs:
@@ -74,7 +106,7 @@ def read_pairs(path: Path, source: str) -> PickedPairs:
         The file cannot be read, a column is missing, a value is no number, or no row is left.
     """
     rows = csv_rows(path)
-    of_cloud = [row for row in rows if (row.get("cloud") or source) == source]
+    of_cloud = [row for row in rows if _is_of(row, source)]
     if rows and not of_cloud:
         others = ", ".join(sorted({str(row.get("cloud")) for row in rows}))
         msg = (
@@ -82,7 +114,7 @@ def read_pairs(path: Path, source: str) -> PickedPairs:
             "clouds in the order in which they were picked, or leave the column empty."
         )
         raise InputError(msg)
-    used = [row for row in of_cloud if (row.get("role") or "control").strip().lower() != "check"]
+    used = [row for row in of_cloud if _is_used(row)]
     values = np.array([coordinates_in(path, number, row) for number, row in enumerate(used, 2)])
     values = values.reshape(-1, 6)
     return PickedPairs(

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from dougong._words import counted
 from dougong.formats import FileInfo, describe
 from dougong.formats.stream import refuse_empty
 from dougong.pipeline.memory import Room, estimated_bytes
@@ -62,7 +63,8 @@ class Plan:
         """Return the plan in one sentence."""
         tiled = sum(file.way == "on tiles" for file in self.files)
         return (
-            f"{sum(file.points for file in self.files):,} points in {len(self.files)} files"
+            f"{counted(sum(file.points for file in self.files))} in "
+            f"{counted(len(self.files), 'file')}"
             f"{f', {tiled} of them on tiles' if tiled else ''}: about "
             f"{self.memory_bytes / 1e9:.1f} GB of memory and {minutes(self.seconds)} "
             "(rough; `dougong plan` says more)"

@@ -217,7 +217,7 @@ def files_of(entry: Entry, folder: Path) -> list[Path]:
     Raises
     ------
     InputError
-        A path or pattern finds no file.
+        A path or pattern finds no file, or is none.
     """
     found: list[Path] = []
     for text in entry.files:
@@ -228,7 +228,11 @@ def files_of(entry: Entry, folder: Path) -> list[Path]:
             else (folder, text)
         )
         exact = base / pattern
-        matches = [exact] if exact.is_file() else sorted(base.glob(pattern))
+        try:
+            matches = [exact] if exact.is_file() else sorted(base.glob(pattern))
+        except ValueError as error:
+            msg = f"cloud {entry.name!r}: {text!r} is no path and no pattern ({error})."
+            raise InputError(msg) from error
         matches = [match for match in matches if match.is_file()]
         if not matches:
             raise InputError(f"cloud {entry.name!r}: {_why_no_file(text, exact, folder)}")
@@ -339,8 +343,9 @@ def from_files(lidar: Sequence[Path], photogrammetry: Sequence[Path]) -> Project
             "its file is. Rename one, or write a project file (`dougong init DIR`)."
         )
         raise InputError(msg)
+    # Not behind links: what they lead to may have no suffix (as in a cache of data versions).
     clouds = [
-        {"name": stem_of(path), "kind": kind, "files": [str(path.resolve())]}
+        {"name": stem_of(path), "kind": kind, "files": [str(path.absolute())]}
         for kind, path in kinds
     ]
     return validated(Project, {"cloud": clouds}, "the clouds named on the command line")

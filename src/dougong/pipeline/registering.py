@@ -1,11 +1,12 @@
 """Registration of two clouds with what their reference systems say about it."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from dougong.cloud import Cloud
-from dougong.errors import FrameError
+from dougong.errors import FrameError, RegistrationError
 from dougong.formats import has_metric_format, is_same_crs, require_metric, units_of
 from dougong.formats.faults import coordinate_hashes
 from dougong.formats.projection import is_same_plan, projection_problem
@@ -13,6 +14,8 @@ from dougong.pipeline.axes import mirrored_axes, upside_down
 from dougong.pipeline.ground import pair_on_ground, to_file
 from dougong.registration import Register
 from dougong.registration import register as search
+from dougong.registration.checks import checks_document
+from dougong.registration.control import Control
 from dougong.registration.control_solve import ControlPoints
 from dougong.registration.file_coordinates import unit_of
 from dougong.registration.free_scale import ScaleSearch, Side
@@ -90,7 +93,35 @@ def register(
     if is_declared and undeclared is not None and result.status != "ok":
         name = (source if undeclared == "source" else target).name
         notes = (*notes, _undeclared_note(name))
+    if control is not None and result.checks is None:
+        result = replace(result, checks=_unmeasured(control))
     return replace(result, notes=(*different_systems(source, target), *notes, *result.notes))
+
+
+def impossible(
+    error: RegistrationError, params: Register, control: ControlPoints | None
+) -> Registration:
+    """Return the answer for a pair whose search cannot even start."""
+    return Registration(
+        status="failed",
+        matrix=None,
+        reason=str(error),
+        probability=0.0,
+        scale=1.0,
+        dof=params.dof if isinstance(params.dof, int) else 6,
+        coarse_method=params.coarse,
+        hypotheses=(),
+        margin=0.0,
+        fine=None,
+        parameters=params.model_dump(mode="json"),
+        checks=None if control is None else _unmeasured(control),
+    )
+
+
+def _unmeasured(control: ControlPoints) -> dict[str, Any]:
+    """Return what is said of control and check points that have no pose to be measured at."""
+    points = Control(points=control, used=~control.is_check, T_target_source=None)
+    return checks_document(points, None, None)
 
 
 def find_unit(

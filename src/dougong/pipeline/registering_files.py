@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dougong.cloud import Cloud
+from dougong.errors import RegistrationError
 from dougong.formats import (
     describe,
     faults_of,
@@ -28,7 +29,7 @@ from dougong.pipeline.provenance import (
     require_unchanged,
     software,
 )
-from dougong.pipeline.registering import register
+from dougong.pipeline.registering import impossible, register
 from dougong.pipeline.registrations import to_document
 from dougong.pipeline.settings import validated
 from dougong.registration import Register
@@ -60,7 +61,7 @@ def register_files(
     InputError
         A setting, the file of picked pairs or the control file is wrong, or the job needs more
         memory than it may use.
-    FormatError, FrameError, RegistrationError
+    FormatError, FrameError
         The clouds cannot be read or combined.
     """
     params = validated(Register, options, "register")
@@ -72,15 +73,18 @@ def register_files(
     one = _read(source, source_kind, crs[0], progress)
     two = _read(target, target_kind, crs[1], progress)
     progress.stage(f"registering {source.name} onto {target.name}")
-    result = register(
-        one.cloud,
-        two.cloud,
-        params,
-        source_kind=one.kind,
-        target_kind=two.kind,
-        pairs=picked,
-        control=surveyed,
-    )
+    try:
+        result = register(
+            one.cloud,
+            two.cloud,
+            params,
+            source_kind=one.kind,
+            target_kind=two.kind,
+            pairs=picked,
+            control=surveyed,
+        )
+    except RegistrationError as error:
+        result = impossible(error, params, surveyed)
     said = _still_true(result, one, two)
     if one.record["sha256"] == two.record["sha256"]:
         said.insert(0, f"{source.name} and {target.name} are the same file, or copies of one")
@@ -97,7 +101,7 @@ def register_files(
         target=two.cloud.name,
         source_frame=one.cloud.frame,
         target_frame=two.cloud.frame,
-        files=[str(source.resolve())],
+        files=[str(source.absolute())],
     )
     write_registration(out, "registration", document, ends)
     return document

@@ -9,6 +9,7 @@ from typing import Any
 from dougong.pipeline.control import (
     control_of_project,
     quality_document,
+    quality_notes,
 )
 from dougong.pipeline.distances import (
     write_distances,
@@ -137,6 +138,7 @@ def _result(project: Project, loader: Loader, out: Path) -> dict[str, Any]:
         "parameters": project_document(project, loader.shown),
         "inputs": list(loader.inputs.values()),
         "notes": [
+            *quality_notes(quality),
             *notes_of(linked),
             *(f"{merged['file']}: {note}" for note in merged["notes"]),
             *full_notes(full),

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from dougong.filters.selection import Reason
 from dougong.pipeline.distances import (
     distances_document,
 )
@@ -65,8 +66,18 @@ def cloud_document(link: Linked, loader: Loader) -> dict[str, Any]:
         "reasons": {name: count for name, count in reasons.items() if count},
         "removal_details": dict(details),
         "removed_shown": sum(len(source.removed) for source in mover.sources),
+        "removed_by_file": [
+            {"removed": _taken_out(source.tally.reasons), "shown": len(source.removed)}
+            for source in mover.sources
+        ],
         "ground_points": sum(source.tally.ground for source in mover.sources),
     }
+
+
+def _taken_out(reasons: Counter[str]) -> int:
+    """Return how many points of a file the sample of removed ones is of."""
+    left = (Reason.KEPT, Reason.DECIMATED)
+    return reasons.total() - sum(reasons[reason.name.lower()] for reason in left)
 
 
 def stage_documents(mover: Mover) -> list[dict[str, Any]]:

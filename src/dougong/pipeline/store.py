@@ -6,6 +6,7 @@ registration setting therefore does not filter again, and a changed filter setti
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +21,7 @@ import dougong
 from dougong.errors import OutputError
 from dougong.params import Parameters
 from dougong.pipeline.books import Books, Page
-from dougong.pipeline.outputs import claim_folder, leave_folder
+from dougong.pipeline.outputs import behind_link, claim_folder, leave_folder
 from dougong.pipeline.steps import StageCount
 from dougong.tiles.folder import Folder, LocalFolder
 from dougong.typing import Kind
@@ -40,8 +41,11 @@ class Store:
 
     @classmethod
     def beside(cls, out: Path) -> "Store":
-        """Return one beside the result, which is deleted once the run is done."""
-        scratch = out.with_name(f"{out.name}.work")
+        """Return one on the disk of the result, which is deleted once the run is done."""
+        place = behind_link(out)
+        # What lies beside a mount point is on another disk, in a container one that is lost.
+        is_mounted = os.path.ismount(place)
+        scratch = place / ".work" if is_mounted else place.with_name(f"{place.name}.work")
         return cls(LocalFolder(scratch), scratch, out, is_temporary=True)
 
     @classmethod

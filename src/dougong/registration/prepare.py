@@ -8,6 +8,7 @@ from pydantic import Field
 
 from dougong._checks import as_points
 from dougong._sorting import distinct
+from dougong._words import counted, of_all
 from dougong.cloud import Cloud
 from dougong.errors import RegistrationError
 from dougong.filters.cloth_simulation import ClothSimulation, cloth_simulation
@@ -74,7 +75,8 @@ class Thinned:
         count, left = len(self.kept), len(self.kept) - int(strays.sum())
         if left >= (1.0 - FEW_STRAYS) * count or left < MIN_POINTS:
             return self
-        note = f"{strays.sum():,} of {count:,} thinned points stand off every surface: dropped"
+        said = of_all(int(strays.sum()), count, "stands", "stand", "thinned point")
+        note = f"{said} off every surface: dropped"
         return replace(self, kept=self.kept[~strays], notes=(*self.notes, note))
 
 
@@ -232,10 +234,12 @@ def _clean(points: Points, params: Prepare, notes: list[str]) -> Index:
         return everything
     kept = everything[~far_points(points)]
     if len(kept) < len(points):
-        notes.append(f"{len(points) - len(kept):,} of {len(points):,} points lie far off: dropped")
+        far = of_all(len(points) - len(kept), len(points), "lies", "lie")
+        notes.append(f"{far} far off: dropped")
     is_alone = isolated_points(points[kept])
     if is_alone.any():
-        notes.append(f"{is_alone.sum():,} of {len(points):,} points stand alone: dropped")
+        alone = of_all(int(is_alone.sum()), len(points), "stands", "stand")
+        notes.append(f"{alone} alone: dropped")
     return kept[~is_alone]
 
 
@@ -282,7 +286,8 @@ def _ground(level: Points, sigma_m: float, params: Prepare, notes: list[str]) ->
     if not params.is_filtered:
         stays = low_outliers(level).is_kept
         if not stays.all():
-            notes.append(f"{(~stays).sum():,} thinned points below the ground: dropped")
+            below = counted(int((~stays).sum()), "thinned point")
+            notes.append(f"{below} below the ground: dropped")
     threshold = params.ground_threshold_m or 0.15 + 4.0 * sigma_m
     found = cloth_simulation(level[stays], ClothSimulation(class_threshold_m=threshold))
     is_ground = np.zeros(len(level), dtype=bool)

@@ -5,8 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dougong.errors import InputError
+from dougong.formats.units import METRES
 from dougong.pipeline.provenance import sha256
+from dougong.typing import Values
 
 _OF_RESULT = ("clouds", "registrations", "inputs", "merged", "project", "reference")
 _OF_REGISTRATION = ("status", "matrix", "source", "target", "inputs")
@@ -55,6 +59,42 @@ def not_as_written(folder: Path, error: Exception) -> InputError:
         f"the JSON files in {folder} are not as this dougong writes them "
         f"({type(error).__name__}: {error}). {_AGAIN}"
     )
+
+
+def in_metres(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a run's or a registration's document with the matrices that clouds are drawn by.
+
+    Those that are written lead from file to file; clouds are drawn in metres.
+    """
+    if "registrations" in document:
+        links = [in_metres(link) for link in document["registrations"]]
+        return {**document, "registrations": links}
+    source, target = (
+        np.array((document.get(name) or {}).get("unit_m") or METRES)
+        for name in ("source_frame", "target_frame")
+    )
+    coarse = document["coarse"]
+    return {
+        **document,
+        "matrix": _in_metres(document["matrix"], source, target),
+        "coarse": {
+            **coarse,
+            "hypotheses": [
+                {**pose, "matrix": _in_metres(pose["matrix"], source, target)}
+                for pose in coarse["hypotheses"]
+            ],
+        },
+    }
+
+
+def _in_metres(
+    matrix: Sequence[Sequence[float]] | None, source_unit: Values, target_unit: Values
+) -> list[list[float]] | None:
+    if matrix is None:
+        return None
+    metric = np.diag([*target_unit, 1.0]) @ np.array(matrix) @ np.diag([*(1.0 / source_unit), 1.0])
+    moved: list[list[float]] = metric.tolist()
+    return moved
 
 
 def replaced_inputs(document: Mapping[str, Any]) -> list[str]:

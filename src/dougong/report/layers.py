@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong.cloud import Cloud
-from dougong.formats import iterate, read
+from dougong.formats import in_system, iterate, read
 from dougong.typing import Points, Transform, Values
 
 MAX_POINTS = 700_000
@@ -82,7 +82,7 @@ class Thinned:
     reasons: NDArray[np.uint8] | None
 
 
-def read_thinned(path: Path, points: int) -> Thinned:
+def read_thinned(path: Path, points: int, system: str | None = None) -> Thinned:
     """Return about `MAX_POINTS` points of a file, evenly taken.
 
     Parameters
@@ -90,13 +90,16 @@ def read_thinned(path: Path, points: int) -> Thinned:
     path : Path
     points : int
         How many points the file has.
+    system : str, optional
+        The reference system, WKT, that was given for a file that names none.
     """
     stride = max(1, -(-points // MAX_POINTS))
     taken: list[Points] = []
     looks: list[tuple[NDArray[Any] | None, ...]] = []
     origin: Values | None = None
     seen = 0
-    for chunk in iterate(path):
+    for stored in iterate(path):
+        chunk = in_system(stored, system) if stored.frame.crs is None else stored
         if origin is None:
             origin = chunk.frame.origin
         chosen = np.arange((-seen) % stride, len(chunk), stride)
@@ -159,7 +162,10 @@ def rigid_inverse(matrix: Transform, origin: Values) -> tuple[Transform, Values]
 
 
 def run_layers(folder: Path, result: dict[str, Any]) -> list[Layer]:
-    """Return the layers of a run: its filtered clouds, the reference last."""
+    """Return the layers of a run: its filtered clouds, the reference last.
+
+    `result` has its matrices in metres (`dougong.report.documents.in_metres`).
+    """
     links = {entry["source"]: entry for entry in result["registrations"]}
     layers = []
     common: Values | None = None
@@ -257,15 +263,17 @@ def _taken_back(xyz: Points, origin: Values, matrix: Transform) -> Points:
 def pair_layers(document: dict[str, Any], folder: Path | None = None) -> list[Layer]:
     """Return the layers of a single registration, from its input files; none if they are gone.
 
-    `folder` is where the registration's own files are: its distances are shown with it.
+    `folder` is where the registration's own files are: its distances are shown with it. `document`
+    has its matrices in metres (`dougong.report.documents.in_metres`).
     """
     source, target = document["inputs"]
     paths = [Path(source["path"]), Path(target["path"])]
     if not all(path.is_file() for path in paths):
         return []
+    frames = (document.get(name) or {} for name in ("source_frame", "target_frame"))
     first_read, second_read = (
-        read_thinned(path, entry["points"])
-        for path, entry in zip(paths, (source, target), strict=True)
+        read_thinned(path, entry["points"], frame.get("crs_wkt"))
+        for path, entry, frame in zip(paths, (source, target), frames, strict=True)
     )
     own, origin = first_read.xyz, first_read.origin
     fixed, common = second_read.xyz, second_read.origin

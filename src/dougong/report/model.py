@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from dougong._words import counted
 from dougong.report.key_numbers import KeyNumber, key_numbers, pair_numbers
 from dougong.report.links import Link, link, network_rows
 from dougong.report.verdict import Verdict, accuracy, plain, run_verdict
@@ -105,7 +106,7 @@ def from_registration(document: Mapping[str, Any]) -> Report:
 
 def _merged(merged: Mapping[str, Any]) -> str:
     """Return what the merged cloud holds and what was left out of it, and why."""
-    said = f"{merged['points']:,} points, source_id per cloud"
+    said = f"{counted(merged['points'])}, source_id per cloud"
     rows = merged.get("sources", {})
     out = [f"{row['left_out']:,} of {name}" for name, row in rows.items() if row["left_out"]]
     if not out:

@@ -14,6 +14,7 @@ from dougong.report.figures import Figure
 from dougong.report.layers import Layer
 from dougong.report.maps import amount_colours, amount_scale, lay_sheet, sheet_plate
 from dougong.report.plates import round_length
+from dougong.typing import Values
 
 WORDS = {
     Reason.DECIMATED: "decimated: another point of its voxel was kept",
@@ -102,9 +103,10 @@ def _map(folder: Path, cloud: Mapping[str, Any], layer: Layer) -> tuple[Figure |
     sheet = lay_sheet(
         layer.after, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), _CELL_M, most=220
     )
-    cells = sheet.cells(xyz)
-    counts = np.bincount(cells[cells >= 0], minlength=sheet.rows * sheet.columns)
-    amount = counts * (whole / len(taken)) / sheet.cell_m**2
+    cells, stands_for = sheet.cells(xyz), _stands_for(cloud, len(taken), whole)
+    is_in = cells >= 0
+    count = np.bincount(cells[is_in], stands_for[is_in], minlength=sheet.rows * sheet.columns)
+    amount = count / sheet.cell_m**2
     own = sheet.cells(layer.after)
     ground = np.bincount(own[own >= 0], minlength=len(amount)) > 0
     limit = max(
@@ -122,3 +124,15 @@ def _map(folder: Path, cloud: Mapping[str, Any], layer: Layer) -> tuple[Figure |
         svg=sheet_plate(sheet, colours, ground | (amount > 0), "removed points from above"),
     )
     return figure, amount_scale(limit, "points per m²")
+
+
+def _stands_for(cloud: Mapping[str, Any], shown: int, whole: int) -> Values:
+    """Return for how many removed points each drawn one stands, (shown,).
+
+    Each file has a sample of its own, one behind the other. Older results do not say how many.
+    """
+    files = [file for file in cloud.get("removed_by_file", ()) if file["shown"]]
+    if sum(file["shown"] for file in files) != shown:
+        return np.full(shown, whole / shown)
+    samples = np.array([file["shown"] for file in files])
+    return np.repeat(np.array([file["removed"] for file in files]) / samples, samples)

@@ -12,6 +12,7 @@ from dougong.errors import DougongError, InputError
 from dougong.pipeline.outputs import write_text
 from dougong.report.annex import Annex, annex_of
 from dougong.report.documents import (
+    in_metres,
     load,
     load_registration,
     load_result,
@@ -56,11 +57,13 @@ def build(folder: Path, *, is_fresh: bool = True) -> Path:
     if result.is_file():
         document = load_result(folder)
         demo = folder / "demo.json"
-        layers = run_layers(folder, document)
+        drawn = in_metres(document)
+        layers = run_layers(folder, drawn)
         report = from_run(document, load(demo) if demo.is_file() else None)
     elif single.is_file():
         document = load_registration(folder)
-        layers = pair_layers(document, folder)
+        drawn = in_metres(document)
+        layers = pair_layers(drawn, folder)
         report = from_registration(document)
         if not is_fresh:
             report = replace(report, notes=(*report.notes, *replaced_inputs(document)))
@@ -75,7 +78,7 @@ def build(folder: Path, *, is_fresh: bool = True) -> Path:
         raise InputError(msg)
     path = folder / "report.html"
     place = find_place(layers) if layers else None
-    write_text(path, render(report, layers, annex_of(folder, document, layers, place)))
+    write_text(path, render(report, layers, annex_of(folder, drawn, layers, place)))
     return path
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dougong._words import counted
 from dougong.errors import InputError
 from dougong.formats import FileInfo, describe, read, write
 from dougong.formats.model import Hold
@@ -344,7 +345,7 @@ def _streamable(item: Item, converted: Path, room: Room, say: Note, notes: list[
     info = describe(path)
     if info.format == "COPC":
         return path
-    say(f"converting {_shown_name(item)} ({info.format}, {info.points:,} points) to COPC")
+    say(f"converting {_shown_name(item)} ({info.format}, {counted(info.points)}) to COPC")
     cloud = partial(decoded, path) if is_too_large(path, room, 0) else read(path)
     written = write(cloud, converted, hold=Hold(room.held_points(), converted.parent))
     if item.removed_of is not None:

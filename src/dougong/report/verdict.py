@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from dougong._words import counted
+
 Tone = Literal["good", "unsure", "bad"]
 TONES: dict[str, Tone] = {"ok": "good", "ambiguous": "unsure", "failed": "bad"}
 WORDS: dict[Tone, str] = {"good": "Registered", "unsure": "Ambiguous", "bad": "Not registered"}
@@ -71,24 +73,34 @@ def accuracy(
     documents: Sequence[Mapping[str, Any]], quality: Mapping[str, Any] | None
 ) -> tuple[str, ...]:
     """Return what check points prove, one sentence per registration, or that none were given."""
-    checked = [d for d in documents if (d.get("checks") or {}).get("check")]
-    if not checked:
-        return (NO_CHECKS,)
-    said = []
-    for document in checked:
-        check = document["checks"]["check"]
-        level = check["level"] or "coarser than LOA10"
-        points = f"{check['points']} check point{'s' if check['points'] != 1 else ''}"
-        said.append(
-            f"{document['source']}: {points} that had no part in the fit lie "
-            f"{millimetres(check['check_rmse_m'])} (check RMSE, three dimensions) from their "
-            f"places; with 95 % confidence 95 % of the errors are below "
-            f"{millimetres(check['upper95_m'])}: {level} (USIBD)."
-        )
+    said = [_proved(d["source"], d["checks"]) for d in documents if _has_check_points(d)]
+    said = said or [NO_CHECKS]
     if quality is not None and quality["required_level"] is not None:
         is_reached = "is" if quality["is_reached"] else "is NOT"
         said.append(f"The required level, {quality['required_level']}, {is_reached} reached.")
     return tuple(said)
+
+
+def _has_check_points(document: Mapping[str, Any]) -> bool:
+    return bool((document.get("checks") or {}).get("check_points"))
+
+
+def _proved(source: str, checks: Mapping[str, Any]) -> str:
+    """Return what the check points of a registration prove."""
+    check = checks["check"]
+    points = counted(checks["check_points"], "check point")
+    if check is None:
+        return (
+            f"{source}: {points} had no pose to be measured at, so no accuracy grade is stated "
+            "(no USIBD level of accuracy, LOA)."
+        )
+    level = check["level"] or "coarser than LOA10"
+    return (
+        f"{source}: {points} that had no part in the fit lie "
+        f"{millimetres(check['check_rmse_m'])} (check RMSE, three dimensions) from their "
+        f"places; with 95 % confidence 95 % of the errors are below "
+        f"{millimetres(check['upper95_m'])}: {level} (USIBD)."
+    )
 
 
 def millimetres(metres: float | None) -> str:

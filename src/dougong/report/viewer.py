@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dougong._words import counted
 from dougong.report.figures import Place
 from dougong.report.layers import Layer, Removed
 from dougong.report.looks import SIGNED_TITLE, SIGNED_WORDS, scale_end
@@ -221,7 +222,7 @@ def _natural(shown: list[Layer]) -> str:
 def _lead(shown: list[Layer], packed: list[Packed]) -> str:
     count = sum(cloud.head["points"] for cloud in packed if not cloud.head["has_reason"])
     text = (
-        f"{count:,} points, evenly thinned for this page; positions rounded to "
+        f"{counted(count)}, evenly thinned for this page; positions rounded to "
         f"{STEP_M * 1000:g} mm (off by {STEP_M * 500:g} mm at most along each axis). "
     )
     if any(not layer.is_reference for layer in shown):
@@ -240,7 +241,7 @@ def _lead(shown: list[Layer], packed: list[Packed]) -> str:
     out = sum(cloud.head["points"] for cloud in packed if cloud.head["has_reason"])
     if out:
         text += (
-            f"Removed: {out:,} points that the filters took out, each coloured by its reason; they "
+            f"Removed: {counted(out)} that the filters took out, each coloured by its reason; they "
             "are no part of the result. Decimated points are not among them."
         )
     return text.rstrip()

@@ -31,7 +31,7 @@ from dougong.pipeline.provenance import software
 
 _FEWEST, _MOST = 30_000, 1_000_000_000
 _POOLS = ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "VECLIB")
-_ROOMS = ("kernels", "filters", "registration")
+_ROOMS = ("kernels", "filters", "registration", "evaluation/bench")
 """What our figures depend on: a change there makes old ones void."""
 
 
@@ -75,8 +75,8 @@ def bench(
     """Measure and write ``bench.json`` into the folder `out`, after every group.
 
     A group is one operation at one size with one number of threads: all its contenders are
-    measured in one go. Groups that the file holds already, measured by this code on this machine,
-    are not measured again.
+    measured in one go. Groups that the file holds already, measured by this code on this machine
+    with the same seed and repeats, are not measured again.
 
     Returns
     -------
@@ -111,7 +111,8 @@ def bench(
         key = f"{operation}/{size}/{threads}"
         progress.stage(f"{OPERATIONS[operation].title}: {size:,} points, {threads} threads")
         progress.fraction(done / len(wanted))
-        if key not in groups:
+        asked = {"repeats": setting.repeats, "seed": setting.seed}
+        if not asked.items() <= groups.get(key, {}).items():
             groups[key] = _group(operation, size, threads, setting, work, progress)
             with watched(file):
                 write_json(file, {**about, "groups": _sorted(groups)})

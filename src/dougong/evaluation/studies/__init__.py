@@ -23,6 +23,7 @@ from dougong.evaluation.tabulate import new_figure
 from dougong.pipeline.outputs import finite, refuse_existing, watched, write_json, write_text
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import software
+from dougong.threads import get_threads
 
 STUDIES: Mapping[str, str] = {
     "denoise": "noise filters: noise removed against carving kept",
@@ -38,7 +39,7 @@ STUDIES: Mapping[str, str] = {
 }
 """Every study by its name, with what it measures."""
 
-_ROOMS = ("kernels", "filters", "formats", "registration", "pipeline", "evaluation")
+_ROOMS = ("kernels", "filters", "formats", "tiles", "registration", "pipeline", "evaluation")
 """What the figures depend on."""
 
 
@@ -65,6 +66,12 @@ class Setting:
         runs = self.runs or (quick if self.is_quick else usual)
         return range(self.seed, self.seed + runs)
 
+    def of_rows(self) -> dict[str, Any]:
+        """Return what a row depends on beside its key; which rows there are is no part of it."""
+        data = None if self.data is None else str(self.data.resolve())
+        facts = {"is_quick": self.is_quick, "points": self.points, "data": data}
+        return {**facts, "threads": get_threads()}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
@@ -90,10 +97,11 @@ def measured(
 ) -> list[Mapping[str, Any]]:
     """Return `measure(*key)` of every key; a row that was kept by a stopped run is not made again.
 
-    Rows are kept one per line, with their key, the program's version and the hash of its source,
-    as soon as they are measured. Rows of other source are made again: the document names one.
+    Rows are kept one per line, with their key, the setting, the program's version and the hash of
+    its source, as soon as they are measured. Rows of another setting or source are made again: the
+    document names one.
     """
-    made_by = {"software": software(), "code": _code()}
+    made_by = {"setting": setting.of_rows(), "software": software(), "code": _code()}
     rows: dict[str, Mapping[str, Any]] = {}
     if setting.kept is not None and setting.kept.is_file():
         for text in setting.kept.read_text(encoding="utf-8").splitlines():
