@@ -312,6 +312,16 @@ def test_protective_reaches_farther_in_a_sparse_cloud():
     assert protective.reach_for(wall(57_600, 1, 1.2)) == 0.5
     assert protective.reach_for(wall(40_000, 1, 0.4)) == 0.125
     assert protective.reach_for(np.zeros((3, 3))) == 0.5
+    assert protective.reach_for(np.zeros((300, 3))) == 0.5
+
+
+@pytest.mark.parametrize("heaped", [700, 3000])
+def test_protective_keeps_a_wall_beside_a_heap_of_missing_returns(heaped):
+    surface = wall(1600, 1)
+    with_heap = np.vstack([surface + [0.0, 5.0, 0.0], np.zeros((heaped, 3))])
+    assert protective.reach_for(with_heap) == protective.reach_for(surface)
+    kept = curvature_weighted(with_heap, CurvatureWeighted()).is_kept
+    assert kept[: len(surface)].mean() > 0.98
     assert halo_m(CurvatureWeighted(rule="protective")) == np.inf
 
 

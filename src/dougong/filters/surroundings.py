@@ -87,11 +87,23 @@ class Tested(NamedTuple):
     """(m, 2) links across the border: the group of own points, the place of a point of the halo."""
 
 
+def middle_rank(eighth_m: ValueBlocks, points: int) -> int | None:
+    """Return which of the eighth distances, ascending, is the middle one; None with too few.
+
+    Of points that lie apart: more than eight at one place, as scanners write missing returns, have
+    a distance of 0 and no spacing.
+    """
+    heaped = sum(int(np.count_nonzero(block == 0.0)) for block in eighth_m())
+    apart = points - heaped
+    return heaped + apart // 2 if apart > TESTS else None
+
+
 def reach_of(eighth_m: ValueBlocks, points: int) -> float:
     """Return the reach, metres, of a cloud of so many `points`, by their eighth nearest others."""
-    if points <= TESTS:
+    rank = middle_rank(eighth_m, points)
+    if rank is None:
         return REACH_M
-    spacing = at_rank(eighth_m, points // 2) * math.sqrt(math.pi / TESTS)
+    spacing = at_rank(eighth_m, rank) * math.sqrt(math.pi / TESTS)
     reach = REACH_M
     while reach < SPARSE * spacing:
         reach *= 2.0

@@ -35,7 +35,7 @@ from dougong.filters.statistical import (
     stray_notes,
     takes_places,
 )
-from dougong.filters.surroundings import REACH_M, TESTS, reach_of
+from dougong.filters.surroundings import REACH_M, middle_rank, reach_of
 from dougong.filters.totals import Totals
 from dougong.filters.wires import are_rows
 from dougong.params import Parameters
@@ -357,7 +357,8 @@ def _reach(stage: _Stage, params: CurvatureWeighted) -> tuple[float, str]:
     while True:
         _, found = stage.map("eighth", protective.eighth_within, within)
         eighth = stage.values(found, "largest")
-        if stage.asked <= TESTS or count_finite(eighth) > stage.asked // 2:
+        rank = middle_rank(eighth, stage.asked)
+        if rank is None or count_finite(eighth) > rank:
             reach = reach_of(eighth, stage.asked)
             if reach <= within:
                 return reach, found
