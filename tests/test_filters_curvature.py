@@ -191,6 +191,7 @@ def test_solid_voxels_are_spared_when_asked():
     params = CurvatureWeighted(rule="paper", solid_voxel_count=5)
     chosen = curvature_weighted(points, params, voxel_count=[1, 9])
     assert chosen.is_kept.tolist() == [False, True]
+    assert chosen.attributes["removal_margin"].tolist() == [np.inf, 1.0]
     with pytest.raises(InputError, match="no voxel_count came"):
         curvature_weighted(points, params)
     with pytest.raises(InputError, match=r"shape \(2,\), got \(3,\)"):
@@ -394,6 +395,7 @@ def test_protective_spares_solid_voxels_and_says_so():
     chosen = curvature_weighted([[0.0, 0, 0], [0, 0, 5.0]], params, voxel_count=[1, 9])
     assert chosen.is_kept.tolist() == [False, True]
     assert chosen.attributes["removal_reason"].tolist() == [protective.Taken.ALONE, 0]
+    assert chosen.attributes["removal_margin"][1] == 1.0
     assert curvature_weighted(np.empty((0, 3)), PROTECTIVE).is_kept.tolist() == []
     same = curvature_weighted(np.full((70, 3), 3.3), PROTECTIVE)
     assert np.isfinite(same.attributes["spacing_m"]).all()

@@ -5,6 +5,7 @@ METHOD.md 1.3, equations 1 to 6, in the readings that can work. Kernels are impo
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from dougong.errors import InputError
 from dougong.filters import protective
 from dougong.filters.balls import BLUR, Balls, CellBalls, ExactBalls, Lattice, build_lattice
 from dougong.filters.concentration import concentration_note
-from dougong.filters.selection import Selection
+from dougong.filters.selection import Selection, spare
 from dougong.filters.surroundings import Tests
 from dougong.filters.totals import Totals
 from dougong.params import Parameters
@@ -253,8 +254,9 @@ def curvature_weighted(
     Returns
     -------
     Selection
-        ``removal_margin`` (n,), above 1 for removed points, and ``curvature`` (n,): surface
-        variation, 0 .. 1/3, of the 12 nearest (``protective``) or in the ball of radius_init_m.
+        ``removal_margin`` (n,), above 1 for removed points, at most 1 for kept ones, and
+        ``curvature`` (n,): surface variation, 0 .. 1/3, of the 12 nearest (``protective``) or in
+        the ball of radius_init_m.
         ``protective`` adds ``removal_reason`` (n,) uint8 (`protective.Taken`) and ``spacing_m``
         (n,), and a note where removal concentrates on fine geometry.
 
@@ -271,18 +273,15 @@ def curvature_weighted(
     if p.rule == "protective":
         return _protective(points, p, voxel_count, beside)
     found = _judge(points, p, whole)
-    n = len(found.order)
     is_outlier, margin = found.verdict(p)
-    is_kept = found.unsorted(~is_outlier)
-    if n and p.solid_voxel_count is not None:
-        is_kept |= _is_solid(voxel_count, n, p.solid_voxel_count)
-    return Selection(
-        is_kept=is_kept,
+    chosen = Selection(
+        is_kept=found.unsorted(~is_outlier),
         attributes={
             "curvature": found.unsorted(found.curvature),
             "removal_margin": found.unsorted(margin),
         },
     )
+    return _with_solid(chosen, p, voxel_count)
 
 
 def _protective(
@@ -311,16 +310,21 @@ def protective_choice(
     margin: Values, reason: NDArray[np.uint8], p: CurvatureWeighted, voxel_count: ArrayLike | None
 ) -> Selection:
     """Return the choice of rule ``protective``, solid voxels spared where that is asked."""
-    is_kept = reason == protective.Taken.KEPT
-    if p.solid_voxel_count is not None:
-        is_kept |= _is_solid(voxel_count, len(is_kept), p.solid_voxel_count)
-        reason = np.where(is_kept, protective.Taken.KEPT, reason).astype(np.uint8)
-    return Selection(
-        is_kept=is_kept, attributes={"removal_margin": margin, "removal_reason": reason}
+    chosen = Selection(
+        is_kept=reason == protective.Taken.KEPT, attributes={"removal_margin": margin}
     )
+    chosen = _with_solid(chosen, p, voxel_count)
+    reason = np.where(chosen.is_kept, protective.Taken.KEPT, reason).astype(np.uint8)
+    return replace(chosen, attributes={**chosen.attributes, "removal_reason": reason})
 
 
-def _is_solid(voxel_count: ArrayLike | None, n: int, at_least: int) -> Mask:
+def _with_solid(
+    chosen: Selection, p: CurvatureWeighted, voxel_count: ArrayLike | None
+) -> Selection:
+    """Return the choice with the points that stand for many, where `p` asks for that."""
+    n, at_least = len(chosen.is_kept), p.solid_voxel_count
+    if at_least is None or not n:
+        return chosen
     if voxel_count is None:
         msg = (
             f"solid_voxel_count is {at_least} but no voxel_count came with the points. "
@@ -330,5 +334,4 @@ def _is_solid(voxel_count: ArrayLike | None, n: int, at_least: int) -> Mask:
     counts = np.asarray(voxel_count)
     if counts.shape != (n,):
         raise InputError(f"voxel_count must have shape ({n},), got {counts.shape}.")
-    is_solid: Mask = counts >= at_least
-    return is_solid
+    return spare(chosen, counts >= at_least)

@@ -14,8 +14,8 @@ from dougong.filters.curvature_weighted import CurvatureWeighted, protective_cho
 from dougong.filters.groups import sizes_of
 from dougong.filters.neighbourhood import build_index
 from dougong.filters.protective import Doubtful, row_halo_m, rows_excused
-from dougong.filters.selection import Reason
-from dougong.filters.statistical import nearest_distances, select_near, spare
+from dougong.filters.selection import Reason, spare
+from dougong.filters.statistical import nearest_distances, select_near
 from dougong.filters.surroundings import HALO, SLACK, TESTS, Taken, test_part
 from dougong.tiles import things
 from dougong.tiles.cloud import POINTS, Arrays, Record, Tile, read_arrays, read_file
