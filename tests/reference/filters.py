@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from dougong.filters.octree_voxel_grid import robust_low
+
 
 def octree_voxel_grid(points, low, voxel_m, records=None):
     """Return (is_kept, voxel_count): per voxel the point nearest the centre, ties by content.
@@ -50,8 +52,8 @@ def ball(points, i, radius_m, kind="exact"):
     """Return which points (n,) lie in the ball of point i, exact or made of cells."""
     if kind == "exact":
         return np.linalg.norm(points - points[i], axis=1) <= radius_m
-    cells = np.floor(points / 2.0 ** np.floor(np.log2(radius_m / 16)))
     edge = 2.0 ** np.floor(np.log2(radius_m / 16))
+    cells = np.floor((points - robust_low(points)) / edge)
     return ((cells - cells[i]) ** 2).sum(1) <= (radius_m / edge) ** 2
 
 

@@ -197,9 +197,19 @@ class _Judged(NamedTuple):
         return is_outlier, margin
 
 
-def _judge(points: ArrayLike, p: CurvatureWeighted, totals: Totals | None = None) -> _Judged:
+class Whole(NamedTuple):
+    """What must be known of a cloud to judge a part of it."""
+
+    low: NDArray[np.float64]
+    """(3,) where its cells and steps begin: the `robust_low` of all its points."""
+    totals: Totals | None = None
+    """What ``global`` knows of it."""
+
+
+def _judge(points: ArrayLike, p: CurvatureWeighted, whole: Whole | None = None) -> _Judged:
     """Return curvature, statistic and reference population of `points` (n, 3), eq. 1 to 5."""
-    lattice = build_lattice(points, max(p.radius_init_m, p.radius_max_m))
+    low, totals = whole or (None, None)
+    lattice = build_lattice(points, max(p.radius_init_m, p.radius_max_m), low)
     kind = CellBalls if p.balls == "fast" else ExactBalls
     balls: Balls = kind(lattice, p.radius_init_m)
     curvature = balls.variation()
@@ -210,9 +220,9 @@ def _judge(points: ArrayLike, p: CurvatureWeighted, totals: Totals | None = None
     return _Judged(lattice.order, curvature, steps, *balls.statistics(steps))
 
 
-def own_totals(points: ArrayLike, p: CurvatureWeighted, own: int) -> Totals:
+def own_totals(points: ArrayLike, p: CurvatureWeighted, own: int, whole: Whole) -> Totals:
     """Return what the first `own` of `points` add to the statistics of rule ``global``."""
-    found = _judge(points, p)
+    found = _judge(points, p, whole)
     return Totals.of(found.steps[(found.order < own) & ~found.is_alone])
 
 
@@ -233,7 +243,7 @@ def curvature_weighted(
     params: CurvatureWeighted | None = None,
     *,
     voxel_count: ArrayLike | None = None,
-    whole: Totals | None = None,
+    whole: Whole | None = None,
     beside: ArrayLike | None = None,
 ) -> Selection:
     """Choose the points that have a neighbour about as near as their surroundings do.
@@ -245,8 +255,8 @@ def curvature_weighted(
     params : CurvatureWeighted
     voxel_count : array_like, shape (n,), optional
         How many points each point stands for after decimation; used by `solid_voxel_count`.
-    whole : Totals, optional
-        Where the points are a part of a cloud: what ``global`` knows of it.
+    whole : Whole, optional
+        Where the points are a part of a cloud: what must be known of it.
     beside : array_like, shape (m, 3), optional
         Points that are there too and are not judged, such as the ground: to the rule
         ``protective`` a gravestone without it hovers. The other rules do not look at them.
@@ -262,16 +272,17 @@ def curvature_weighted(
 
     Notes
     -----
-    ``paper`` and ``global`` round coordinates to 2**-18 m (for 0.3 m) and sum exact integers, so
-    nothing depends on the order of the points. The cost of an exact ball grows with the square root
-    of the points in it, that of a fast one does not.
+    ``paper`` and ``global`` round coordinates to 2**-18 m (for 0.3 m) and sum exact integers;
+    steps and cells begin at the low corner of the cloud without far points. So nothing depends on
+    the order of the points or the origin of their frame. The cost of an exact ball grows with the
+    square root of the points in it, that of a fast one does not.
     Tile class: local, with the halo of `halo_m` (``paper``: 2 radius_init_m + radius_max_m, fast
     0.22 radius_init_m more); ``global`` is two-pass. ``protective`` reaches 17 reach_m far, but
     tiles read 5 (`surroundings.HALO`): groups are joined across their borders.
     """
     p = params or CurvatureWeighted()
     if p.rule == "protective":
-        return _protective(points, p, voxel_count, beside)
+        return _protective(points, p, voxel_count, beside, None if whole is None else whole.low)
     found = _judge(points, p, whole)
     is_outlier, margin = found.verdict(p)
     chosen = Selection(
@@ -289,10 +300,11 @@ def _protective(
     p: CurvatureWeighted,
     voxel_count: ArrayLike | None,
     beside: ArrayLike | None,
+    low: NDArray[np.float64] | None,
 ) -> Selection:
     own = as_points(points)
     seen = own if beside is None else np.concatenate([own, as_points(beside)])
-    verdict = protective.judge(seen, p.tests, p.reach_m).of_first(len(own))
+    verdict = protective.judge(seen, p.tests, p.reach_m, low).of_first(len(own))
     chosen = protective_choice(verdict.margin, verdict.reason, p, voxel_count)
     note = None
     if len(chosen.is_kept):

@@ -77,6 +77,14 @@ def robust_box(points: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]
     return robust_box_of(lambda: (points,), len(points))
 
 
+def robust_low(points: Points) -> NDArray[np.float64]:
+    """Return where cells begin that shall not depend on the frame: the `robust_box`'s low corner.
+
+    (3,), zeros where there are no points.
+    """
+    return robust_box(points)[0] if len(points) else np.zeros(3)
+
+
 def robust_box_of(blocks: Blocks, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the `robust_box` of a cloud that comes in blocks, passed over two to four times.
 

@@ -150,8 +150,13 @@ def spacing_shown(eighth_m: Values, reach_m: float) -> Values:
     return spacing
 
 
-def test_cloud(index: Neighbourhood, reach_m: float | None, tests: Tests) -> tuple[Tested, float]:
-    """Test all points of a cloud; return what is found and the reach, given or found."""
+def test_cloud(
+    index: Neighbourhood, reach_m: float | None, tests: Tests, low: NDArray[np.float64]
+) -> tuple[Tested, float]:
+    """Test all points of a cloud; return what is found and the reach, given or found.
+
+    low (3,): where the cells of `local_spacing` begin.
+    """
     from dougong.kernels import protective as kernels
 
     n = len(index.points)
@@ -164,30 +169,37 @@ def test_cloud(index: Neighbourhood, reach_m: float | None, tests: Tests) -> tup
             _BLOCK,
             lambda start, stop: kernels.drop_far(index.points, places, reach**2, start, stop),
         )
-    spacing = local_spacing(index.points, spacing_shown(eighth, reach), reach, n)
+    spacing = local_spacing(index.points, spacing_shown(eighth, reach), reach, n, low)
     return _tested(index, places, spacing, n, is_all, reach, tests), reach
 
 
-def test_part(points: Points, eighth_m: Values, own: int, reach_m: float, tests: Tests) -> Tested:
+def test_part(
+    points: Points,
+    eighth_m: Values,
+    own: int,
+    reach_m: float,
+    tests: Tests,
+    low: NDArray[np.float64],
+) -> Tested:
     """Test the first `own` of the points (n, 3) of a part; the others are its halo.
 
-    eighth_m (n,): how far the eighth nearest other is, in the whole cloud.
+    eighth_m (n,): how far the eighth nearest other is, in the whole cloud. low (3,): of that.
     """
     from dougong.filters.neighbourhood import build_index
 
     if not own:
         return _nothing()
-    low, high = corners_of(points[:own])
+    lowest, highest = corners_of(points[:own])
     found = _FOUND * reach_m * SLACK
-    is_near = are_within(points, low - found, high + found)
+    is_near = are_within(points, lowest - found, highest + found)
     # What is farther has a say in the spacing only. Own points come first still.
     order = np.concatenate([np.flatnonzero(is_near), np.flatnonzero(~is_near)])
     near = int(is_near.sum())
     shown = spacing_shown(eighth_m[order], reach_m)
-    spacing = local_spacing(points[order], shown, reach_m, near)
+    spacing = local_spacing(points[order], shown, reach_m, near, low)
     index = build_index(points[order[:near]])
     reach = reach_m * SLACK
-    is_seen = are_within(index.points, low - reach, high + reach)
+    is_seen = are_within(index.points, lowest - reach, highest + reach)
     places, _ = _neighbours(index, reach_m, is_seen)
     tested = _tested(index, places, spacing[index.order], own, is_seen, reach_m, tests)
     tested.across[:, 1] = order[tested.across[:, 1]] - own

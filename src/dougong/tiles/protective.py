@@ -34,15 +34,16 @@ def eighth_within(job: Job) -> tuple[Arrays, Record]:
 
 
 def test_points(job: Job) -> tuple[Arrays, Record]:
-    """Test a tile's points; known: the step of `eighth_within`, and the reach.
+    """Test a tile's points; known: the step of `eighth_within`, the reach, the low corner.
 
     Leaves of every point what the tests say and its group, and tables of the groups, of the links
     across the border, and of the points that may go.
     """
     assert isinstance(job.params, CurvatureWeighted)
-    step, reach = job.known
+    step, reach, low = job.known
     part = with_halo(job, HALO * reach * SLACK, step=step, found="largest")
-    tested = test_part(part.points, part.more["largest"], part.own, reach, job.params.tests)
+    eighth, tests = part.more["largest"], job.params.tests
+    tested = test_part(part.points, eighth, part.own, reach, tests, np.array(low))
     own = part.points[: part.own]
     sizes = sizes_of(own, tested.spacing_m, tested.curvature, tested.group)
     place = protective.doubtful_of(tested, sizes.are_large(reach))
