@@ -270,6 +270,13 @@ def curvature_weighted(
         ``protective`` adds ``removal_reason`` (n,) uint8 (`protective.Taken`) and ``spacing_m``
         (n,), and a note where removal concentrates on fine geometry.
 
+    Raises
+    ------
+    InputError
+        `points` or `beside` is not (n, 3) or not finite; points lie too far apart for the balls of
+        ``paper`` and ``global``; `solid_voxel_count` is set and there is not one `voxel_count` per
+        point.
+
     Notes
     -----
     ``paper`` and ``global`` round coordinates to 2**-18 m (for 0.3 m) and sum exact integers;

@@ -201,6 +201,11 @@ def octree_voxel_grid(
     Selection
         ``voxel_count`` (n,) int32: the points in the voxel of each point.
 
+    Raises
+    ------
+    InputError
+        `points` is not (n, 3) or not finite, or there is not one record per point.
+
     Notes
     -----
     Ties: smallest (x, y, z), then smallest record bytes. Tile class: two-pass (the box first).

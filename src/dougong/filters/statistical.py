@@ -193,6 +193,11 @@ def statistical(points: ArrayLike, params: Statistical | None = None) -> Selecti
         ``removal_margin`` (n,): the same as a share of the cut, above 1 for removed points; at
         most 1 for spared ones.
 
+    Raises
+    ------
+    InputError
+        `points` is not (n, 3) or not finite.
+
     Notes
     -----
     O(n log n). Tile class: two-pass (`Totals` add up over tiles).
