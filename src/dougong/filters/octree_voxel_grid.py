@@ -210,8 +210,6 @@ def octree_voxel_grid(
     -----
     Ties: smallest (x, y, z), then smallest record bytes. Tile class: two-pass (the box first).
     """
-    from dougong.kernels import octree
-
     params = params or OctreeVoxelGrid()
     xyz = as_points(points)
     n = len(xyz)
@@ -221,11 +219,24 @@ def octree_voxel_grid(
         return Selection(
             is_kept=np.zeros(0, bool), attributes={"voxel_count": np.zeros(0, np.int32)}
         )
-    low, _, voxel_m = root or root_cube(xyz, params)
+    records_at = partial(chosen_rows, records) if isinstance(records, np.ndarray) else records
+    chosen, counts = _nearest_to_centres(xyz, root or root_cube(xyz, params), records_at)
+    is_kept = np.zeros(n, bool)
+    is_kept[chosen] = True
+    return Selection(is_kept=is_kept, attributes={"voxel_count": counts.astype(np.int32)})
+
+
+def _nearest_to_centres(
+    xyz: Points, root: Root, records_at: Callable[[Index], NDArray[Any]] | None
+) -> tuple[Index, Index]:
+    """Return the place of the point chosen of each voxel, and how many (n,) are in each point's."""
+    from dougong.kernels import octree
+
+    low, _, voxel_m = root
     places, run_starts = runs_of_cells(xyz, low, voxel_m)
     runs = len(run_starts) - 1
     chosen, twins = np.empty(runs, np.int64), np.empty(runs, np.int64)
-    counts = np.empty(n, np.int64)
+    counts = np.empty(len(xyz), np.int64)
 
     def task(first: int, last: int) -> None:
         octree.nearest_to_centres(
@@ -233,12 +244,9 @@ def octree_voxel_grid(
         )
 
     for_blocks(runs, 1 << 16, task)
-    if records is not None and (twins > 1).any():
-        records_at = records if callable(records) else partial(chosen_rows, records)
+    if records_at is not None and (twins > 1).any():
         _settle_twins(xyz, records_at, places, run_starts, twins > 1, chosen)
-    is_kept = np.zeros(n, bool)
-    is_kept[chosen] = True
-    return Selection(is_kept=is_kept, attributes={"voxel_count": counts.astype(np.int32)})
+    return chosen, counts
 
 
 def cells_of(points: Points, low: NDArray[np.float64], edge_m: float) -> Points:
