@@ -14,6 +14,7 @@ from dougong.filters.cloth_simulation import GROUND, ClothSimulation, cloth_simu
 from dougong.filters.clusters import clusters_of, eighth_nearest
 from dougong.filters.clutter import Clutter, clutter
 from dougong.filters.clutter_kinds import ClutterKind
+from dougong.filters.clutter_search import Whole, search
 from dougong.filters.clutter_shapes import shape_of
 from dougong.filters.neighbourhood import build_index
 from dougong.kernels import clusters as kernels
@@ -215,6 +216,26 @@ def test_a_pole_under_a_roof_is_a_column():
 def test_a_shape_of_one_place_is_possible():
     shape = shape_of(np.zeros((20, 3)), np.ones(20))
     assert shape.length_m == shape.width_m == shape.body_m == 0.0
+
+
+def test_a_part_with_the_feet_alone_knows_whose_they_are():
+    points = sampled(things.visitor(np.random.default_rng(3)))[0]
+    up = points[points[:, 2] > 0.09]
+    params = Clutter()
+    feet = (up[:, 2] < params.foot_m) & (up[:, 0] > np.median(up[up[:, 2] < params.foot_m, 0]))
+    # The first one by content lies with the feet.
+    up[feet, 0] -= 0.01 + up[feet, 0].min() - up[~feet, 0].min()
+    whole = search(up, up[:, 2], params)
+    assert whole.counts["person_clusters"] == 1
+    total = {}
+    for mine in (feet, ~feet):
+        order = np.argsort(~mine, kind="stable")
+        own = int(mine.sum())
+        found = search(up[order], up[order, 2], params, Whole(own, has_rows=False))
+        np.testing.assert_array_equal(found.kind[:own], whole.kind[mine])
+        for name, count in found.counts.items():
+            total[name] = total.get(name, 0) + count
+    assert total == whole.counts
 
 
 def on_ground():

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from dougong import threads
+from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.evaluation.facade import FEATURE, NOISE_LABELS, SURFACE, bracketed_facade
 from dougong.filters import protective
@@ -14,9 +15,11 @@ from dougong.filters.balls import BLUR
 from dougong.filters.concentration import concentration_note, tally, together
 from dougong.filters.curvature_weighted import (
     CurvatureWeighted,
+    Whole,
     curvature_weighted,
     halo_m,
 )
+from dougong.filters.octree_voxel_grid import robust_low
 from dougong.filters.statistical import Statistical, statistical
 from reference import filters as twin
 from reference import protective as slow
@@ -72,12 +75,22 @@ def test_map_sized_coordinates_change_nothing(shift):
     np.testing.assert_array_equal(here.attributes["curvature"], there.attributes["curvature"])
 
 
+@pytest.mark.parametrize("params", [PAPER, FAST, CurvatureWeighted()], ids=str)
+def test_the_origin_of_the_frame_changes_no_verdict(params):
+    points = np.round(bracketed_facade(150.0, 0.05, 3)[0], 3)
+    is_kept = curvature_weighted(points, params).is_kept
+    assert 20 < (~is_kept).sum() < 0.9 * len(points)
+    for shift in ([0.37, 0.21, 0.64], [431_234.567, 4_001_234.123, 301.011]):
+        moved = Cloud.from_points(points + np.array(shift)).xyz
+        np.testing.assert_array_equal(curvature_weighted(moved, params).is_kept, is_kept)
+
+
 def test_a_far_point_changes_nothing_but_itself():
     points = crease(2000, 6)
     far = curvature_weighted(np.concatenate([points, [[1e6, 1e6, -1e6]]]), PAPER)
     assert far.is_kept.tolist() == [*curvature_weighted(points, PAPER).is_kept, False]
     with pytest.raises(InputError, match="too far for balls"):
-        curvature_weighted([[1e11, 0, 0]], PAPER)
+        curvature_weighted([[0, 0, 0], [1e11, 0, 0]], PAPER)
 
 
 @pytest.mark.parametrize("params", [PAPER, FAST], ids=["exact", "fast"])
@@ -87,7 +100,7 @@ def test_a_tile_with_its_halo_gives_what_the_whole_gives(params):
     whole = curvature_weighted(points, params)
     core = (points[:, 0] >= 4.0) & (points[:, 0] < 7.0)
     read = (points[:, 0] >= 4.0 - halo_m(params)) & (points[:, 0] < 7.0 + halo_m(params))
-    tile = curvature_weighted(points[read], params)
+    tile = curvature_weighted(points[read], params, whole=Whole(robust_low(points)))
     np.testing.assert_array_equal(tile.is_kept[core[read]], whole.is_kept[core])
     assert halo_m(PAPER) == pytest.approx(0.9)
 
@@ -191,6 +204,7 @@ def test_solid_voxels_are_spared_when_asked():
     params = CurvatureWeighted(rule="paper", solid_voxel_count=5)
     chosen = curvature_weighted(points, params, voxel_count=[1, 9])
     assert chosen.is_kept.tolist() == [False, True]
+    assert chosen.attributes["removal_margin"].tolist() == [np.inf, 1.0]
     with pytest.raises(InputError, match="no voxel_count came"):
         curvature_weighted(points, params)
     with pytest.raises(InputError, match=r"shape \(2,\), got \(3,\)"):
@@ -264,7 +278,8 @@ def test_protective_needs_no_more_of_the_cloud_than_its_halo():
     reach = halo_m(PROTECTIVE)
     whole = curvature_weighted(points, PROTECTIVE).attributes["removal_margin"]
     core, read = points[:, 0] < 4.0, points[:, 0] < 4.0 + reach
-    tile = curvature_weighted(points[read], PROTECTIVE).attributes["removal_margin"]
+    of_cloud = Whole(robust_low(points))
+    tile = curvature_weighted(points[read], PROTECTIVE, whole=of_cloud).attributes["removal_margin"]
     assert not read.all()
     np.testing.assert_array_equal(tile[core[read]], whole[core])
 
@@ -312,6 +327,16 @@ def test_protective_reaches_farther_in_a_sparse_cloud():
     assert protective.reach_for(wall(57_600, 1, 1.2)) == 0.5
     assert protective.reach_for(wall(40_000, 1, 0.4)) == 0.125
     assert protective.reach_for(np.zeros((3, 3))) == 0.5
+    assert protective.reach_for(np.zeros((300, 3))) == 0.5
+
+
+@pytest.mark.parametrize("heaped", [700, 3000])
+def test_protective_keeps_a_wall_beside_a_heap_of_missing_returns(heaped):
+    surface = wall(1600, 1)
+    with_heap = np.vstack([surface + [0.0, 5.0, 0.0], np.zeros((heaped, 3))])
+    assert protective.reach_for(with_heap) == protective.reach_for(surface)
+    kept = curvature_weighted(with_heap, CurvatureWeighted()).is_kept
+    assert kept[: len(surface)].mean() > 0.98
     assert halo_m(CurvatureWeighted(rule="protective")) == np.inf
 
 
@@ -384,6 +409,7 @@ def test_protective_spares_solid_voxels_and_says_so():
     chosen = curvature_weighted([[0.0, 0, 0], [0, 0, 5.0]], params, voxel_count=[1, 9])
     assert chosen.is_kept.tolist() == [False, True]
     assert chosen.attributes["removal_reason"].tolist() == [protective.Taken.ALONE, 0]
+    assert chosen.attributes["removal_margin"][1] == 1.0
     assert curvature_weighted(np.empty((0, 3)), PROTECTIVE).is_kept.tolist() == []
     same = curvature_weighted(np.full((70, 3), 3.3), PROTECTIVE)
     assert np.isfinite(same.attributes["spacing_m"]).all()

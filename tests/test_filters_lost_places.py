@@ -59,6 +59,22 @@ def test_far_points_do_not_matter():
     assert "600 in all" in note
 
 
+def test_places_at_both_ends_of_the_world_are_told_whatever_the_parts():
+    ground, stele, _ = scene()
+    taken = np.concatenate([stele, stele + [3e6, 3e6, 3e6]])
+    asked = np.concatenate([ground, taken])
+    notes = {said(taken, asked, parts) for parts in (1, 2, 5)}
+    (note,) = notes
+    assert note is not None
+    assert "2 places of 0.5 m, 1,200 in all" in note
+
+
+def test_one_far_stray_beside_an_ordinary_one_is_no_place():
+    ground, _, _ = scene()
+    strays = np.array([[2.0, 2.0, 40.0], [1e6, 2.0, 40.0]])
+    assert said(strays, np.concatenate([ground, strays])) is None
+
+
 def test_tiles_say_it_as_the_whole_does(tmp_path):
     rng = np.random.default_rng(1)
     wall = rng.uniform([0, 0, 0], [20, 0, 4], (60_000, 3))

@@ -47,6 +47,18 @@ def test_stray_points_go_and_nothing_else(number, slope):
     assert not low[depth < 0].any()
 
 
+def test_a_point_as_high_as_the_floor_stays_in_any_frame():
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(0, 20, (8000, 2)), np.zeros(8000)])
+    deep = np.column_stack([rng.uniform(2, 18, (60, 2)), np.tile([-1.65, -0.3, -0.301], 20)])
+    points = np.round(np.vstack([ground, deep]), 3)
+    low = is_low(points)
+    assert 20 < low.sum() < 60
+    assert not low[points[:, 2] >= -0.3].any()
+    for up in (0.64, -0.7, 301.011):
+        np.testing.assert_array_equal(is_low(points + [0.0, 0.0, up]), low)
+
+
 LEVELS = {
     "courtyard 12 x 12 m, 3 m deep": ((15, 27, 15, 27), 3.0),
     "moat 4 m wide, 4 m deep": ((5, 9, 0, 40), 4.0),

@@ -9,6 +9,7 @@ import pytest
 
 from dougong import filters
 from dougong.errors import InputError
+from dougong.filters import neighbourhood
 
 NAMES = list(filters.FILTERS)
 INF = float("inf")
@@ -33,6 +34,16 @@ def test_a_row_is_what_its_module_declares(name):
     assert spec.params is getattr(filters, spec.model) is getattr(module, spec.model)
     assert spec.verb is getattr(filters, name) is getattr(module, name)
     assert spec.halo_m(spec.params()) == pytest.approx(HALOS[name])
+
+
+@pytest.mark.parametrize(
+    "verb",
+    [filters.FILTERS[name].verb for name in NAMES]
+    + [neighbourhood.nearest, neighbourhood.knn, neighbourhood.normals],
+)
+def test_what_is_refused_is_documented(verb):
+    said = verb.__doc__.partition("    Raises\n    ------\n    InputError\n")[2]
+    assert "(n, 3)" in said or "(m, 3)" in said
 
 
 def test_halos_follow_from_the_parameters():

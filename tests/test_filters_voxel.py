@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from dougong import threads
+from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.filters.octree_voxel_grid import (
     OctreeVoxelGrid,
+    Root,
     octree_voxel_grid,
     robust_box,
     root_cube,
@@ -67,10 +69,41 @@ def test_the_box_keeps_sparse_ends_and_drops_isolated_ones():
     np.testing.assert_array_equal(high, wall.max(0))
 
 
+MAP = np.array([431_234.567, 4_001_234.123, 301.011])
+
+
+@pytest.mark.parametrize(
+    "params",
+    [
+        *(OctreeVoxelGrid(voxel_m=edge) for edge in (0.005, 0.003, 0.007, 0.02, 0.0125, 1 / 300)),
+        *(OctreeVoxelGrid(depth=depth) for depth in (6, 8, 9)),
+    ],
+    ids=str,
+)
+def test_the_origin_of_the_frame_changes_no_choice(params):
+    rng = np.random.default_rng(4)
+    millimetres = np.unique(rng.integers(0, [700, 40, 700], (40_000, 3)), axis=0)
+    given_points = rng.permutation(millimetres) / 1000
+    kept = octree_voxel_grid(given_points, params).is_kept
+    for shift in ([1000.0, 2000.0, 10.0], [0.37, 0.21, 0.64], MAP):
+        moved = Cloud.from_points(given_points + np.array(shift)).xyz
+        np.testing.assert_array_equal(octree_voxel_grid(moved, params).is_kept, kept)
+    order = rng.permutation(len(given_points))
+    shuffled = octree_voxel_grid(given_points[order], params).is_kept
+    np.testing.assert_array_equal(shuffled, kept[order])
+    if params.voxel_m in (0.005, 0.003, 0.007, 0.02):
+        voxels = (millimetres - millimetres.min(0)) // round(params.voxel_m * 1000)
+        assert kept.sum() == len(np.unique(voxels, axis=0))
+
+
+def test_a_part_beside_the_root_cube_is_decimated():
+    points = np.array([[-5.0, -7, -9], [-6.0, -8, -9]])
+    beside = octree_voxel_grid(points, OctreeVoxelGrid(voxel_m=1.0), root=Root(MAP, 10.0, 1.0))
+    assert beside.is_kept.all()
+
+
 def test_cells_beyond_the_curve_are_still_voxels():
     points = np.array([[0.0, 0, 0], [0.4, 0, 0], [5e6, 0, 0], [5e6 + 0.4, 0, 0], [-5e6, 0, 0]])
-    from dougong.filters.octree_voxel_grid import Root
-
     root = Root(np.zeros(3), 1.0, 1.0)
     chosen = octree_voxel_grid(points, OctreeVoxelGrid(voxel_m=1.0), root=root)
     assert chosen.attributes["voxel_count"].tolist() == [2, 2, 2, 2, 1]
@@ -88,8 +121,8 @@ def test_cells_beyond_the_curve_are_still_voxels():
     ],
 )
 def test_small_and_degenerate_clouds(points, kept):
-    chosen = octree_voxel_grid(points, OctreeVoxelGrid(voxel_m=0.1 + 1e-9))
-    assert chosen.is_kept.sum() == kept - (1 if kept == 11 else 0)
+    chosen = octree_voxel_grid(points, OctreeVoxelGrid(voxel_m=0.1))
+    assert chosen.is_kept.sum() == kept
     assert octree_voxel_grid(points, OctreeVoxelGrid(depth=3)).is_kept.shape == (len(points),)
 
 

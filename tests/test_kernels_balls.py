@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dougong.filters.balls import CellBalls, ExactBalls, build_lattice
+from dougong.filters.octree_voxel_grid import robust_low
 from dougong.kernels import balls, least_weighted
 from dougong.kernels.ball_walk import CHUNK
 from dougong.kernels.moments import least_share
@@ -66,7 +67,7 @@ def test_cells_give_one_sum_to_all_their_points_in_any_part():
     lattice = build_lattice(points, RADIUS_M)
     means = CellBalls(lattice, RADIUS_M).statistics(steps[lattice.order])[0]
     near = np.flatnonzero((points[:, 0] > 0.2) & (points[:, 0] < 0.9))
-    part = build_lattice(points[near], RADIUS_M)
+    part = build_lattice(points[near], RADIUS_M, robust_low(points))
     again = CellBalls(part, RADIUS_M).statistics(steps[near][part.order])[0]
     whole, parted = lattice.unsorted(means), part.unsorted(again)
     deep = (points[near, 0] > 0.54) & (points[near, 0] < 0.56)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dougong.filters.neighbourhood import spatial_order
-from dougong.kernels import moments, order
+from dougong.kernels import cells, moments, order
 
 
 def interleaved(cell):
@@ -23,6 +23,26 @@ def test_keys_interleave_the_bits(cells):
     keys = np.empty(len(points), np.uint64)
     order.morton_keys(points, np.zeros(3), 0.25, 0, len(points), keys)
     assert keys.tolist() == [interleaved(cell) for cell in cells]
+
+
+def test_no_keys_are_sorted_too():
+    keys, places = np.empty(0, np.uint64), np.empty(0, np.int64)
+    # In plain Python, which checks its indices.
+    sort = getattr(order.radix_argsort, "py_func", order.radix_argsort)
+    sort(keys, 63, places, places.copy(), keys.copy())
+
+
+@pytest.mark.parametrize("edge", [1e-9, 1e-6, 0.005, 0.3, 1.0, 4096.0, 1e7])
+def test_steps_are_below_a_micrometre_and_levels_are_nested(edge):
+    steps, halved = cells.steps_per_edge(edge), cells.steps_per_edge(edge / 2)
+    assert edge / steps < 1e-6 or steps in (1, 2**30)
+    assert halved == steps / 2 or steps in (1, 2**30)
+    points = np.random.default_rng(0).normal(0, 30 * edge, (2000, 3))
+    wide, narrow = np.empty((2, 2000, 3))
+    cells.fill_cells(points, np.zeros(3), edge, wide)
+    cells.fill_cells(points, np.zeros(3), edge / 2, narrow)
+    if steps not in (1, 2**30):
+        np.testing.assert_array_equal(np.floor(narrow / 2), wide)
 
 
 def test_cells_out_of_range_are_clamped_not_wrapped():

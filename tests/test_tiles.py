@@ -12,7 +12,12 @@ import pytest
 from dougong.cli import call
 from dougong.cloud import Cloud
 from dougong.errors import OutputError
-from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid, robust_box
+from dougong.filters.octree_voxel_grid import (
+    OctreeVoxelGrid,
+    cells_of,
+    octree_voxel_grid,
+    robust_box,
+)
 from dougong.formats import faults_of, read
 from dougong.threads import set_threads
 from dougong.tiles.cloud import read_arrays
@@ -71,11 +76,26 @@ def test_a_voxel_lies_in_one_tile():
     parts = part(points, grid)
     tile = np.empty(len(points), np.int64)
     tile[parts.order] = np.repeat(np.arange(len(parts.tiles)), np.diff(parts.starts))
-    voxel = np.unique(np.floor((points - grid.low) / 0.05), axis=0, return_inverse=True)[1]
+    voxel = np.unique(cells_of(points, grid.low, 0.05), axis=0, return_inverse=True)[1]
     assert len(np.unique(np.column_stack([voxel, tile]), axis=0)) == voxel.max() + 1
     for number in range(len(parts.tiles)):
         own = parts.order[parts.starts[number] : parts.starts[number + 1]]
         assert (np.diff(own) > 0).all()  # the cloud's order, so that ties are settled alike
+
+
+def test_tiles_of_millimetres_at_map_coordinates_keep_what_the_whole_keeps(tmp_path):
+    rng = np.random.default_rng(6)
+    points = rng.integers(0, [700, 40, 700], (40_000, 3)) / 1000
+    params = OctreeVoxelGrid(voxel_m=0.007)
+    cloud = Cloud.from_points(points + [431_234.567, 4_001_234.123, 301.011])
+    whole = octree_voxel_grid(points, params)
+    tiled = partition(
+        Spool(pieces(cloud, 9999), tmp_path), params, LocalFolder(tmp_path), 1500, 500
+    )
+    row, _, count = joined(tiled)
+    assert len(tiled.tiles) > 20
+    np.testing.assert_array_equal(points[row], points[whole.is_kept])
+    np.testing.assert_array_equal(count, whole.attributes["voxel_count"][whole.is_kept])
 
 
 def test_children_halve_a_tile():

@@ -144,6 +144,7 @@ SMALL_ALONE = np.vstack(
     ]
 )
 SPARSE = np.random.default_rng(2).uniform([0, 0, 0], [60, 0.01, 60], (2500, 3))
+HEAPED = np.vstack([site(4, 800), np.zeros((2500, 3))])
 DENSE = np.random.default_rng(3).uniform([0, 0, 0], [0.3, 0.001, 0.3], (20_000, 3))
 
 
@@ -156,6 +157,7 @@ DENSE = np.random.default_rng(3).uniform([0, 0, 0], [0.3, 0.001, 0.3], (20_000, 
         (SMALL_ALONE, 0.3, 40),
         (SPARSE, None, 150),
         (DENSE, None, 1500),
+        (HEAPED, None, 600),
         (SMALL_ALONE[:8], None, 3),
         (SMALL_ALONE[:9], 0.5, 3),
     ],

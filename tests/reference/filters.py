@@ -2,17 +2,25 @@
 
 import numpy as np
 
+from dougong.filters.octree_voxel_grid import robust_low
+
 
 def octree_voxel_grid(points, low, voxel_m, records=None):
-    """Return (is_kept, voxel_count): per voxel the point nearest the centre, ties by content."""
+    """Return (is_kept, voxel_count): per voxel the point nearest the centre, ties by content.
+
+    Coordinates are rounded to the voxel's edge halved until a step is below a micrometre.
+    """
+    steps = 1
+    while voxel_m / steps >= 1e-6 and steps < 2**30:
+        steps *= 2
+    place = np.rint((points - low) / (voxel_m / steps)).astype(int)
     is_kept = np.zeros(len(points), bool)
     count = np.zeros(len(points), int)
     voxels = {}
-    for i, cell in enumerate(map(tuple, np.floor((points - low) / voxel_m))):
+    for i, cell in enumerate(map(tuple, place // steps)):
         voxels.setdefault(cell, []).append(i)
     for cell, members in voxels.items():
-        off = (points[members] - low) / voxel_m - np.array(cell) - 0.5
-        rank = np.round((off**2).sum(1), 10)
+        rank = ((place[members] - steps * np.array(cell) - steps // 2) ** 2).sum(1)
         content = [b"" if records is None else records[i].tobytes() for i in members]
         keys = zip(rank, points[members].tolist(), content, members, strict=True)
         is_kept[min(keys)[-1]] = True
@@ -44,8 +52,8 @@ def ball(points, i, radius_m, kind="exact"):
     """Return which points (n,) lie in the ball of point i, exact or made of cells."""
     if kind == "exact":
         return np.linalg.norm(points - points[i], axis=1) <= radius_m
-    cells = np.floor(points / 2.0 ** np.floor(np.log2(radius_m / 16)))
     edge = 2.0 ** np.floor(np.log2(radius_m / 16))
+    cells = np.floor((points - robust_low(points)) / edge)
     return ((cells - cells[i]) ** 2).sum(1) <= (radius_m / edge) ** 2
 
 

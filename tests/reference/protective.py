@@ -7,11 +7,13 @@ from scipy.stats import binom
 
 from dougong.filters import local_spacing
 from dougong.filters.groups import BETWEEN, FLAT, GROUP, LINK, MANY, PIECE, SOLID
+from dougong.filters.octree_voxel_grid import robust_low
 from reference.filters import distances
 
 
-def spacing(points, own, edge):
+def spacing(points, own, edge, low):
     """Return B-spline weighted count and mean log2 (n,) of `own` over cells of `edge`."""
+    points = points - low + edge / 2
     cells = {}
     for i, cell in enumerate(map(tuple, np.floor(points / edge).astype(int))):
         cells.setdefault(cell, []).append(math.log2(own[i]))
@@ -125,8 +127,9 @@ def judge(points, alpha, gamma, limits, rule, reach=0.5):
     ranked = np.sort(table, axis=1)
     eighth = ranked[:, rule.TESTS - 1] if n > rule.TESTS else np.full(n, np.inf)
     own = np.maximum(np.minimum(eighth, reach) * math.sqrt(math.pi / rule.TESTS), 2.0**-14)
-    held, near_log = spacing(points, own, local_spacing.NEAR_CELLS * reach)
-    _, far_log = spacing(points, own, local_spacing.FAR_CELLS * reach)
+    low = robust_low(points)
+    held, near_log = spacing(points, own, local_spacing.NEAR_CELLS * reach, low)
+    _, far_log = spacing(points, own, local_spacing.FAR_CELLS * reach, low)
     usual = np.exp2((held * near_log + local_spacing.FEW * far_log) / (held + local_spacing.FEW))
     args = (alpha, gamma, reach, rule.NEIGHBOURS, usual, math.pi / 2 * limits[-1])
     near, variation, axes, divisors = frames(points, order, table, *args)

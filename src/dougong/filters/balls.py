@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from dougong._checks import as_points
 from dougong._sorting import unsorted
 from dougong.errors import InputError
-from dougong.filters.octree_voxel_grid import runs_of_cells
+from dougong.filters.octree_voxel_grid import robust_low, runs_of_cells
 from dougong.threads import for_blocks
 from dougong.typing import Index, Values
 
@@ -53,10 +53,13 @@ class Lattice(NamedTuple):
         return unsorted(values, self.order)
 
 
-def build_lattice(points: ArrayLike, radius_m: float) -> Lattice:
+def build_lattice(
+    points: ArrayLike, radius_m: float, low: NDArray[np.float64] | None = None
+) -> Lattice:
     """Return `points` (n, 3), rounded to steps of at most radius_m / 2**16, as a tree.
 
-    The steps count from the local origin, so parts of a cloud are rounded alike.
+    The steps count from `low` (3,), by default the points' `robust_low`, so that nothing depends
+    on their frame. Parts of a cloud that are given the same are rounded alike.
 
     Raises
     ------
@@ -66,19 +69,20 @@ def build_lattice(points: ArrayLike, radius_m: float) -> Lattice:
     from dougong.filters.neighbourhood import sort_into_index
 
     xyz = as_points(points)
+    low = robust_low(xyz) if low is None else low
     step_m = 2.0 ** math.floor(math.log2(radius_m / _LATTICE_STEPS))
     steps = np.empty_like(xyz)
 
     def task(start: int, stop: int) -> None:
         # To multiply by a power of two is to divide by one, and faster.
-        np.rint(xyz[start:stop] * (1.0 / step_m), out=steps[start:stop])
+        np.rint((xyz[start:stop] - low) * (1.0 / step_m), out=steps[start:stop])
 
     for_blocks(len(xyz), _POINTS_AT_ONCE, task)
     lattice = Lattice(*sort_into_index(steps), step_m)
     if len(xyz) and np.abs(lattice.boxes[1]).max() > 2**52:
         msg = (
-            f"points reach {np.abs(xyz).max():.3g} m from the local origin, too far for balls of "
-            f"{radius_m} m (at most {2**52 * step_m:.3g} m). Move the origin or drop far points."
+            f"points reach {np.abs(xyz - low).max():.3g} m from the others, too far for balls of "
+            f"{radius_m} m (at most {2**52 * step_m:.3g} m). Drop far points."
         )
         raise InputError(msg)
     return lattice

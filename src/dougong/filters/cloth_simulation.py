@@ -153,7 +153,8 @@ def cloth_simulation(points: Points, params: ClothSimulation | None = None) -> S
     Raises
     ------
     InputError
-        The cloth would have more than `MAX_PARTICLES` particles, or `points` is not (n, 3).
+        `points` is not (n, 3) or not finite, the cloth would have more than `MAX_PARTICLES`
+        particles, or `guard` would need too many cells.
     """
     params = params or ClothSimulation()
     points = as_points(points)

@@ -64,7 +64,7 @@ def clutter(
     Raises
     ------
     InputError
-        Heights do not match the points.
+        `points` is not (n, 3) or not finite, or heights do not match them.
 
     Notes
     -----

@@ -169,6 +169,8 @@ def _offered(
     is_small = (clusters.held >= p.min_points) & (clusters.longest_m <= p.largest_m)
     has_own = np.zeros(len(clusters.root), bool)
     has_own[clusters.root[site.place < own]] = True
+    for beside, places in site.low.items():
+        has_own[beside] |= (places < own).any()
     roots = np.flatnonzero(is_small & has_own)
     offered: list[tuple[Index, ClutterKind, float]] = []
     for root, members_of in zip(roots, members(clusters, roots), strict=True):

@@ -5,6 +5,7 @@ METHOD.md 1.3, equations 1 to 6, in the readings that can work. Kernels are impo
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from dougong.errors import InputError
 from dougong.filters import protective
 from dougong.filters.balls import BLUR, Balls, CellBalls, ExactBalls, Lattice, build_lattice
 from dougong.filters.concentration import concentration_note
-from dougong.filters.selection import Selection
+from dougong.filters.selection import Selection, spare
 from dougong.filters.surroundings import Tests
 from dougong.filters.totals import Totals
 from dougong.params import Parameters
@@ -196,9 +197,19 @@ class _Judged(NamedTuple):
         return is_outlier, margin
 
 
-def _judge(points: ArrayLike, p: CurvatureWeighted, totals: Totals | None = None) -> _Judged:
+class Whole(NamedTuple):
+    """What must be known of a cloud to judge a part of it."""
+
+    low: NDArray[np.float64]
+    """(3,) where its cells and steps begin: the `robust_low` of all its points."""
+    totals: Totals | None = None
+    """What ``global`` knows of it."""
+
+
+def _judge(points: ArrayLike, p: CurvatureWeighted, whole: Whole | None = None) -> _Judged:
     """Return curvature, statistic and reference population of `points` (n, 3), eq. 1 to 5."""
-    lattice = build_lattice(points, max(p.radius_init_m, p.radius_max_m))
+    low, totals = whole or (None, None)
+    lattice = build_lattice(points, max(p.radius_init_m, p.radius_max_m), low)
     kind = CellBalls if p.balls == "fast" else ExactBalls
     balls: Balls = kind(lattice, p.radius_init_m)
     curvature = balls.variation()
@@ -209,9 +220,9 @@ def _judge(points: ArrayLike, p: CurvatureWeighted, totals: Totals | None = None
     return _Judged(lattice.order, curvature, steps, *balls.statistics(steps))
 
 
-def own_totals(points: ArrayLike, p: CurvatureWeighted, own: int) -> Totals:
+def own_totals(points: ArrayLike, p: CurvatureWeighted, own: int, whole: Whole) -> Totals:
     """Return what the first `own` of `points` add to the statistics of rule ``global``."""
-    found = _judge(points, p)
+    found = _judge(points, p, whole)
     return Totals.of(found.steps[(found.order < own) & ~found.is_alone])
 
 
@@ -232,7 +243,7 @@ def curvature_weighted(
     params: CurvatureWeighted | None = None,
     *,
     voxel_count: ArrayLike | None = None,
-    whole: Totals | None = None,
+    whole: Whole | None = None,
     beside: ArrayLike | None = None,
 ) -> Selection:
     """Choose the points that have a neighbour about as near as their surroundings do.
@@ -244,8 +255,8 @@ def curvature_weighted(
     params : CurvatureWeighted
     voxel_count : array_like, shape (n,), optional
         How many points each point stands for after decimation; used by `solid_voxel_count`.
-    whole : Totals, optional
-        Where the points are a part of a cloud: what ``global`` knows of it.
+    whole : Whole, optional
+        Where the points are a part of a cloud: what must be known of it.
     beside : array_like, shape (m, 3), optional
         Points that are there too and are not judged, such as the ground: to the rule
         ``protective`` a gravestone without it hovers. The other rules do not look at them.
@@ -253,36 +264,42 @@ def curvature_weighted(
     Returns
     -------
     Selection
-        ``removal_margin`` (n,), above 1 for removed points, and ``curvature`` (n,): surface
-        variation, 0 .. 1/3, of the 12 nearest (``protective``) or in the ball of radius_init_m.
+        ``removal_margin`` (n,), above 1 for removed points, at most 1 for kept ones, and
+        ``curvature`` (n,): surface variation, 0 .. 1/3, of the 12 nearest (``protective``) or in
+        the ball of radius_init_m.
         ``protective`` adds ``removal_reason`` (n,) uint8 (`protective.Taken`) and ``spacing_m``
         (n,), and a note where removal concentrates on fine geometry.
 
+    Raises
+    ------
+    InputError
+        `points` or `beside` is not (n, 3) or not finite; points lie too far apart for the balls of
+        ``paper`` and ``global``; `solid_voxel_count` is set and there is not one `voxel_count` per
+        point.
+
     Notes
     -----
-    ``paper`` and ``global`` round coordinates to 2**-18 m (for 0.3 m) and sum exact integers, so
-    nothing depends on the order of the points. The cost of an exact ball grows with the square root
-    of the points in it, that of a fast one does not.
+    ``paper`` and ``global`` round coordinates to 2**-18 m (for 0.3 m) and sum exact integers;
+    steps and cells begin at the low corner of the cloud without far points. So nothing depends on
+    the order of the points or the origin of their frame. The cost of an exact ball grows with the
+    square root of the points in it, that of a fast one does not.
     Tile class: local, with the halo of `halo_m` (``paper``: 2 radius_init_m + radius_max_m, fast
     0.22 radius_init_m more); ``global`` is two-pass. ``protective`` reaches 17 reach_m far, but
     tiles read 5 (`surroundings.HALO`): groups are joined across their borders.
     """
     p = params or CurvatureWeighted()
     if p.rule == "protective":
-        return _protective(points, p, voxel_count, beside)
+        return _protective(points, p, voxel_count, beside, None if whole is None else whole.low)
     found = _judge(points, p, whole)
-    n = len(found.order)
     is_outlier, margin = found.verdict(p)
-    is_kept = found.unsorted(~is_outlier)
-    if n and p.solid_voxel_count is not None:
-        is_kept |= _is_solid(voxel_count, n, p.solid_voxel_count)
-    return Selection(
-        is_kept=is_kept,
+    chosen = Selection(
+        is_kept=found.unsorted(~is_outlier),
         attributes={
             "curvature": found.unsorted(found.curvature),
             "removal_margin": found.unsorted(margin),
         },
     )
+    return _with_solid(chosen, p, voxel_count)
 
 
 def _protective(
@@ -290,10 +307,11 @@ def _protective(
     p: CurvatureWeighted,
     voxel_count: ArrayLike | None,
     beside: ArrayLike | None,
+    low: NDArray[np.float64] | None,
 ) -> Selection:
     own = as_points(points)
     seen = own if beside is None else np.concatenate([own, as_points(beside)])
-    verdict = protective.judge(seen, p.tests, p.reach_m).of_first(len(own))
+    verdict = protective.judge(seen, p.tests, p.reach_m, low).of_first(len(own))
     chosen = protective_choice(verdict.margin, verdict.reason, p, voxel_count)
     note = None
     if len(chosen.is_kept):
@@ -311,16 +329,21 @@ def protective_choice(
     margin: Values, reason: NDArray[np.uint8], p: CurvatureWeighted, voxel_count: ArrayLike | None
 ) -> Selection:
     """Return the choice of rule ``protective``, solid voxels spared where that is asked."""
-    is_kept = reason == protective.Taken.KEPT
-    if p.solid_voxel_count is not None:
-        is_kept |= _is_solid(voxel_count, len(is_kept), p.solid_voxel_count)
-        reason = np.where(is_kept, protective.Taken.KEPT, reason).astype(np.uint8)
-    return Selection(
-        is_kept=is_kept, attributes={"removal_margin": margin, "removal_reason": reason}
+    chosen = Selection(
+        is_kept=reason == protective.Taken.KEPT, attributes={"removal_margin": margin}
     )
+    chosen = _with_solid(chosen, p, voxel_count)
+    reason = np.where(chosen.is_kept, protective.Taken.KEPT, reason).astype(np.uint8)
+    return replace(chosen, attributes={**chosen.attributes, "removal_reason": reason})
 
 
-def _is_solid(voxel_count: ArrayLike | None, n: int, at_least: int) -> Mask:
+def _with_solid(
+    chosen: Selection, p: CurvatureWeighted, voxel_count: ArrayLike | None
+) -> Selection:
+    """Return the choice with the points that stand for many, where `p` asks for that."""
+    n, at_least = len(chosen.is_kept), p.solid_voxel_count
+    if at_least is None or not n:
+        return chosen
     if voxel_count is None:
         msg = (
             f"solid_voxel_count is {at_least} but no voxel_count came with the points. "
@@ -330,5 +353,4 @@ def _is_solid(voxel_count: ArrayLike | None, n: int, at_least: int) -> Mask:
     counts = np.asarray(voxel_count)
     if counts.shape != (n,):
         raise InputError(f"voxel_count must have shape ({n},), got {counts.shape}.")
-    is_solid: Mask = counts >= at_least
-    return is_solid
+    return spare(chosen, counts >= at_least)

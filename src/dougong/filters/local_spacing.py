@@ -5,8 +5,9 @@ Kernels are imported when called.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dougong.filters.octree_voxel_grid import runs_of_cells
+from dougong.filters.octree_voxel_grid import cells_of, runs_of_cells
 from dougong.threads import for_blocks
 from dougong.typing import Index, Points, Values
 
@@ -22,27 +23,35 @@ SMALLEST_M = 2.0**-14
 _BLOCK = 1 << 13
 
 
-def local_spacing(points: Points, own_m: Values, reach_m: float, first: int) -> Values:
+def local_spacing(
+    points: Points, own_m: Values, reach_m: float, first: int, low: NDArray[np.float64]
+) -> Values:
     """Return the spacing usual round the `first` of the points: the mean over their surroundings.
 
-    points (n, 3) and the spacing that each shows itself, own_m (n,); returns (first,), metres.
+    points (n, 3) and the spacing that each shows itself, own_m (n,); low (3,): the `robust_low` of
+    the whole cloud, where its cells begin. Returns (first,), metres.
 
     A geometric mean by points: noise is few and hardly counts. Where few points are near, the
     wider surroundings count more, so a flock of birds is not measured by itself.
     """
     steps = np.rint(np.log2(np.maximum(own_m, SMALLEST_M) / SMALLEST_M) * STEPS)
-    near, mean_near = _smooth(points, steps.astype(np.int64), NEAR_CELLS * reach_m, first)
-    _, mean_far = _smooth(points, steps.astype(np.int64), FAR_CELLS * reach_m, first)
+    steps = steps.astype(np.int64)
+    near, mean_near = _smooth(points, steps, NEAR_CELLS * reach_m, first, low)
+    _, mean_far = _smooth(points, steps, FAR_CELLS * reach_m, first, low)
     mean = (near * mean_near + FEW * mean_far) / (near + FEW)
     spacing: Values = SMALLEST_M * np.exp2(mean / STEPS)
     return spacing
 
 
-def _smooth(points: Points, steps: Index, edge: float, first: int) -> tuple[Values, Values]:
+def _smooth(
+    points: Points, steps: Index, edge: float, first: int, low: NDArray[np.float64]
+) -> tuple[Values, Values]:
     """Return smoothed count and mean (first,) of `steps` (n,) over cells of `edge` metres."""
-    from dougong.kernels import protective as kernels
+    from dougong.kernels.local_spacing import smooth_means
 
-    keys, axes, cell = _cells_of(points, edge)
+    # What hovers outermost lies in the middle of a cell: a surface behind it has its say there.
+    low = low - edge / 2.0
+    keys, axes, cell = _occupied(cells_of(points, low, edge))
     around = _around(keys, axes)
     held = np.bincount(cell, minlength=len(keys))
     sums = np.bincount(cell, weights=steps, minlength=len(keys)).astype(np.int64)
@@ -50,21 +59,20 @@ def _smooth(points: Points, steps: Index, edge: float, first: int) -> tuple[Valu
     for_blocks(
         first,
         _BLOCK,
-        lambda start, stop: kernels.smooth_means(
-            points, edge, cell, around, held, sums, start, stop, count, mean
+        lambda start, stop: smooth_means(
+            points, low, edge, cell, around, held, sums, start, stop, count, mean
         ),
     )
     return count, mean
 
 
-def _cells_of(points: Points, edge: float) -> tuple[Index, list[Index], Index]:
-    """Return the occupied cells and the cell (n,) of every point, a place among them.
+def _occupied(cells: Points) -> tuple[Index, list[Index], Index]:
+    """Return the occupied cells and that of every point, a place among them, by `cells` (n, 3).
 
     A cell is its key, ascending: which of the coordinates that occur along each axis it has.
     """
-    cells = np.floor(points / edge)
     low = cells.min(axis=0, initial=np.inf)
-    places, starts = runs_of_cells(cells, low, 1.0) if len(points) else (np.zeros(0, int),) * 2
+    places, starts = runs_of_cells(cells, low, 1.0) if len(cells) else (np.zeros(0, int),) * 2
     occupied = cells[places[starts[:-1]]].astype(np.int64)
     axes = [np.unique(occupied[:, axis]) for axis in range(3)]
     at = [np.searchsorted(axis, occupied[:, k]) for k, axis in enumerate(axes)]
@@ -72,7 +80,7 @@ def _cells_of(points: Points, edge: float) -> tuple[Index, list[Index], Index]:
     order = np.argsort(keys)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    cell = np.empty(len(points), np.int64)
+    cell = np.empty(len(cells), np.int64)
     cell[places] = np.repeat(rank, np.diff(starts))
     return keys[order], axes, cell
 

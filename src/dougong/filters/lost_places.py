@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong._boxes import are_within
-from dougong._sorting import grouped, keys_of_rows
-from dougong.filters.octree_voxel_grid import summed_cells
+from dougong.filters.octree_voxel_grid import runs_of_cells, summed_cells
 from dougong.typing import Index, Points
 
 EDGE_M = 0.5
@@ -25,8 +24,6 @@ SHARE = 0.6
 """A place is lost where more than this share of its points went."""
 LEAST_POINTS = 200
 """Fewer points in all are not spoken of."""
-_SPAN = 1 << 20
-"""Cells farther apart than this are left out: 500 km."""
 
 
 Taken = Callable[[], Iterable[Points]]
@@ -76,22 +73,17 @@ def lost_cells(taken: Taken, asked: Taken, edge_m: float = EDGE_M) -> tuple[Poin
 
 def _counted(points: Points, edge_m: float) -> tuple[Points, Index]:
     """Return the cells of points (n, 3), n >= 1, each once, and how many points each has."""
-    cells = np.floor(points / edge_m)
-    middle = np.median(cells, axis=0)
-    cells = cells[(np.abs(cells - middle) < _SPAN / 2).all(axis=1)]
-    if not len(cells):
-        return cells, np.zeros(0, np.int64)
-    return summed_cells(cells, np.ones(len(cells), np.int64))
+    return summed_cells(np.floor(points / edge_m), np.ones(len(points), np.int64))
 
 
 def _held(points: Points, cells: Points, edge_m: float) -> Index:
-    """Return how many of `points` (n, 3) each of the cells (m, 3), m >= 1, holds."""
+    """Return how many of `points` (n, 3) each of the cells (m, 3), m >= 1, each once, holds."""
     at = np.floor(points / edge_m)
     near = at[are_within(at, cells.min(axis=0), cells.max(axis=0))]
+    both = np.concatenate([cells, near])
+    places, starts = runs_of_cells(both, both.min(axis=0), 1.0)
+    counts = np.diff(starts)
+    held = np.empty(len(both), np.int64)
+    held[places] = np.repeat(counts, counts)
     # Each cell counts itself once.
-    columns = np.concatenate([cells, near]).astype(np.int64).T
-    keys = keys_of_rows(tuple(columns))
-    if keys is None:
-        return np.full(len(cells), np.iinfo(np.int64).max // 2)
-    found = grouped(keys)
-    return found.counts[found.place[: len(cells)]] - 1
+    return held[: len(cells)] - 1

@@ -120,7 +120,7 @@ def low_outliers(points: Points, params: LowOutliers | None = None) -> Selection
     Raises
     ------
     InputError
-        `points` is not (n, 3) or not finite.
+        `points` is not (n, 3) or not finite, or the cloud would need too many cells of `cell_m`.
     """
     params = params or LowOutliers()
     points = as_points(points)

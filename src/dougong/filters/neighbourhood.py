@@ -165,6 +165,11 @@ def nearest(
         Places in the array given to `build_index`; -1 where nothing is in reach.
     distance_m : ndarray, shape (m,)
         Inf where nothing is in reach.
+
+    Raises
+    ------
+    InputError
+        `queries` is not (m, 3) or not finite, or `max_distance_m` is not positive.
     """
     limit2 = _check_distance(max_distance_m, "max_distance_m")
     asked = as_points(queries, "queries")
@@ -210,6 +215,11 @@ def knn(
         Places in the array given to `build_index`; -1 where there are fewer.
     distance_m : ndarray, shape (m, k)
         Inf where there are fewer.
+
+    Raises
+    ------
+    InputError
+        `queries` is not (m, 3) or not finite, `k` is below 1 or `max_distance_m` not positive.
     """
     limit2 = _check_distance(max_distance_m, "max_distance_m")
     if k < 1:
@@ -349,6 +359,12 @@ def normals(
     Surface
         From the covariance about the neighbourhood's mean. The sign of a normal says nothing about
         the outside: it points up.
+
+    Raises
+    ------
+    InputError
+        `points` is not (n, 3) or not finite, `neighbours` is below 2 or `max_distance_m` not
+        positive.
     """
     if neighbours < 2:
         raise InputError(f"neighbours must be at least 2 to span a plane, got {neighbours}.")

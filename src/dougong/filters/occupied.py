@@ -33,8 +33,10 @@ def deepest_leaf_m(blocks: Blocks, root: Root, most: int) -> float:
 def _keys(points: Points, root: Root, level: int) -> NDArray[np.uint64]:
     """Return the nodes that hold points, each once."""
     from dougong.kernels import order
+    from dougong.kernels.raster import MICRON
 
-    is_inside = are_within(points, root.low, root.low + root.edge_m)
+    # The cube's edge is rounded to so much.
+    is_inside = are_within(points, root.low - MICRON, root.low + root.edge_m + MICRON)
     inside = np.ascontiguousarray(points if is_inside.all() else points[is_inside])
     keys = np.empty(len(inside), np.uint64)
     cell_m = root.edge_m / 2.0**level

@@ -1,7 +1,8 @@
 """Decimation: one original point per voxel of an octree level, the one nearest its centre.
 
 METHOD.md 1.1. Kept points keep every attribute; which one is kept depends only on the points, never
-on their order. Kernels are imported when called: the model loads without Numba.
+on their order or the origin of their frame: less than a micrometre below a border counts as on it
+(`kernels.cells`). Kernels are imported when called: the model loads without Numba.
 """
 
 from collections.abc import Callable
@@ -74,6 +75,14 @@ def robust_box(points: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]
     Below five points there are no suspects.
     """
     return robust_box_of(lambda: (points,), len(points))
+
+
+def robust_low(points: Points) -> NDArray[np.float64]:
+    """Return where cells begin that shall not depend on the frame: the `robust_box`'s low corner.
+
+    (3,), zeros where there are no points.
+    """
+    return robust_box(points)[0] if len(points) else np.zeros(3)
 
 
 def robust_box_of(blocks: Blocks, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -155,8 +164,11 @@ def root_cube(points: Points, params: OctreeVoxelGrid) -> Root:
 
 def root_cube_of(blocks: Blocks, count: int, params: OctreeVoxelGrid) -> Root:
     """Return the `root_cube` of a cloud that comes in blocks (see `robust_box_of`)."""
+    from dougong.kernels.raster import rounded
+
     low, high = robust_box_of(blocks, count)
-    edge = float((high - low).max())
+    # Rounded like what it is compared with: leaves are the same in every frame.
+    edge = max(rounded(high[axis], low[axis]) for axis in range(3))
     if params.voxel_m is not None:
         return Root(low, edge, params.voxel_m)
     assert params.depth is not None
@@ -189,12 +201,15 @@ def octree_voxel_grid(
     Selection
         ``voxel_count`` (n,) int32: the points in the voxel of each point.
 
+    Raises
+    ------
+    InputError
+        `points` is not (n, 3) or not finite, or there is not one record per point.
+
     Notes
     -----
     Ties: smallest (x, y, z), then smallest record bytes. Tile class: two-pass (the box first).
     """
-    from dougong.kernels import octree
-
     params = params or OctreeVoxelGrid()
     xyz = as_points(points)
     n = len(xyz)
@@ -204,11 +219,24 @@ def octree_voxel_grid(
         return Selection(
             is_kept=np.zeros(0, bool), attributes={"voxel_count": np.zeros(0, np.int32)}
         )
-    low, _, voxel_m = root or root_cube(xyz, params)
+    records_at = partial(chosen_rows, records) if isinstance(records, np.ndarray) else records
+    chosen, counts = _nearest_to_centres(xyz, root or root_cube(xyz, params), records_at)
+    is_kept = np.zeros(n, bool)
+    is_kept[chosen] = True
+    return Selection(is_kept=is_kept, attributes={"voxel_count": counts.astype(np.int32)})
+
+
+def _nearest_to_centres(
+    xyz: Points, root: Root, records_at: Callable[[Index], NDArray[Any]] | None
+) -> tuple[Index, Index]:
+    """Return the place of the point chosen of each voxel, and how many (n,) are in each point's."""
+    from dougong.kernels import octree
+
+    low, _, voxel_m = root
     places, run_starts = runs_of_cells(xyz, low, voxel_m)
     runs = len(run_starts) - 1
     chosen, twins = np.empty(runs, np.int64), np.empty(runs, np.int64)
-    counts = np.empty(n, np.int64)
+    counts = np.empty(len(xyz), np.int64)
 
     def task(first: int, last: int) -> None:
         octree.nearest_to_centres(
@@ -216,12 +244,21 @@ def octree_voxel_grid(
         )
 
     for_blocks(runs, 1 << 16, task)
-    if records is not None and (twins > 1).any():
-        records_at = records if callable(records) else partial(chosen_rows, records)
+    if records_at is not None and (twins > 1).any():
         _settle_twins(xyz, records_at, places, run_starts, twins > 1, chosen)
-    is_kept = np.zeros(n, bool)
-    is_kept[chosen] = True
-    return Selection(is_kept=is_kept, attributes={"voxel_count": counts.astype(np.int32)})
+    return chosen, counts
+
+
+def cells_of(points: Points, low: NDArray[np.float64], edge_m: float) -> Points:
+    """Return the cell (n, 3) of each of `points` (n, 3), counted from `low` (3,): whole numbers.
+
+    Rounded as `kernels.cells` says, so that a border is the same in every frame.
+    """
+    from dougong.kernels.cells import fill_cells
+
+    found = np.empty_like(points, order="F")
+    fill_cells(points, low, edge_m, found)
+    return found
 
 
 def runs_of_cells(xyz: Points, low: NDArray[np.float64], voxel_m: float) -> tuple[Index, Index]:
@@ -230,11 +267,10 @@ def runs_of_cells(xyz: Points, low: NDArray[np.float64], voxel_m: float) -> tupl
 
     n = len(xyz)
     top = float(1 << order.KEY_BITS)
-    lowest, highest = corners_of(xyz)
-    span = (highest - low) / voxel_m
+    first, last = cells_of(np.stack(corners_of(xyz)), low, voxel_m)
     is_inside: Mask = np.ones(n, bool)
-    if span.max() >= top or (lowest < low).any():
-        cells = np.floor((xyz - low) / voxel_m)
+    if last.max() >= top or first.min() < 0:
+        cells = cells_of(xyz, low, voxel_m)
         is_inside = np.asarray(((cells >= 0) & (cells < top)).all(axis=1))
     places = np.flatnonzero(is_inside)
     inside = xyz if len(places) == n else xyz[places]
@@ -243,14 +279,14 @@ def runs_of_cells(xyz: Points, low: NDArray[np.float64], voxel_m: float) -> tupl
         inside, low, voxel_m, start, stop, keys
     )
     for_blocks(len(places), 1 << 18, keying)
-    bits = 3 * min(order.KEY_BITS, int(min(span.max(), top)).bit_length())
+    bits = 3 * min(order.KEY_BITS, int(np.clip(last.max(), 0, top)).bit_length())
     order.radix_argsort(keys, bits, places, np.empty_like(places), np.empty_like(keys))
     starts = np.flatnonzero(np.concatenate(([len(keys) > 0], keys[1:] != keys[:-1])))
     if len(places) == n:
         return places, np.append(starts, n)
     # Outside the curve's cells only stray points lie: sorted by their cells as they are.
     outside = np.flatnonzero(~is_inside)
-    cells = np.floor((xyz[outside] - low) / voxel_m)
+    cells = cells_of(xyz[outside], low, voxel_m)
     by_cell = np.lexsort(cells.T)
     cells = cells[by_cell]
     is_start = np.concatenate(([True], (cells[1:] != cells[:-1]).any(axis=1)))

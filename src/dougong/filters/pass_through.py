@@ -187,7 +187,8 @@ def pass_through(
     Raises
     ------
     InputError
-        A condition on height is asked for without heights.
+        `points` is not (n, 3) or not finite, or a condition on height is asked for without a
+        height of each.
 
     Notes
     -----

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from dougong._checks import as_points
 from dougong.filters.groups import GROUP, Sizes, pieces_joined, sizes_of
 from dougong.filters.local_spacing import FAR_CELLS
+from dougong.filters.octree_voxel_grid import robust_low
 from dougong.filters.surroundings import (
     CHARGE,
     NEIGHBOURS,
@@ -97,13 +98,22 @@ def halo_m(reach_m: float | None) -> float:
     return reach_m * (5.0 * GROUP + 3.0 + 2.0 * FAR_CELLS)
 
 
-def judge(points: ArrayLike, tests: Tests, reach_m: float | None = None) -> Verdict:
-    """Judge the points (n, 3) of a whole cloud, metres."""
+def judge(
+    points: ArrayLike,
+    tests: Tests,
+    reach_m: float | None = None,
+    low: NDArray[np.float64] | None = None,
+) -> Verdict:
+    """Judge the points (n, 3) of a whole cloud, metres.
+
+    low (3,): where its cells begin, by default at its `robust_low`.
+    """
     from dougong.filters.clusters import distance_to
     from dougong.filters.neighbourhood import build_index
 
     index = build_index(points)
-    tested, reach = test_cloud(index, reach_m, tests)
+    low = robust_low(index.points) if low is None else low
+    tested, reach = test_cloud(index, reach_m, tests, low)
     margin, reason = tested.margin, tested.reason
     if is_too_few(len(margin), reach_m):
         margin[:], reason[:] = 0.0, Taken.KEPT

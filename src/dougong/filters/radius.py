@@ -41,6 +41,11 @@ def radius(points: ArrayLike, params: Radius | None = None) -> Selection:
         ``neighbour_count`` (n,) int64: other points within the radius; ``removal_margin`` (n,):
         those needed per one there is, above 1 for removed points.
 
+    Raises
+    ------
+    InputError
+        `points` is not (n, 3) or not finite.
+
     Notes
     -----
     O(n log n): whole nodes are counted, so the cost hardly grows with the neighbours.

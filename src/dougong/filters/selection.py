@@ -1,7 +1,7 @@
 """What every filter returns: a choice over its input's points, never new points."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any
 
@@ -48,6 +48,17 @@ class Selection:
     """What the user should know, in words and counted."""
     found: Mapping[str, int] = field(default_factory=dict)
     """What was found besides, counted under names (clutter: clusters and points per kind)."""
+
+
+def spare(chosen: Selection, is_wanted: Mask) -> Selection:
+    """Return the choice with the points (n,) that another rule keeps, whatever this one says."""
+    is_spared = is_wanted & ~chosen.is_kept
+    margin = chosen.attributes["removal_margin"]
+    return replace(
+        chosen,
+        is_kept=chosen.is_kept | is_spared,
+        attributes={**chosen.attributes, "removal_margin": np.where(is_spared, 1.0, margin)},
+    )
 
 
 DETAIL, MARGIN = "dougong_detail", "dougong_margin"

@@ -14,11 +14,11 @@ from dougong._checks import as_points
 from dougong._words import counted
 from dougong.filters.lost_places import EDGE_M, Taken, lost_cells
 from dougong.filters.ranks import ValueBlocks, at_rank, count_finite
-from dougong.filters.selection import Selection
+from dougong.filters.selection import Selection, spare
 from dougong.filters.totals import LARGEST, Totals
 from dougong.params import Parameters
 from dougong.threads import for_blocks
-from dougong.typing import Index, Mask, Points, Values
+from dougong.typing import Index, Points, Values
 
 if TYPE_CHECKING:
     from dougong.filters.neighbourhood import Neighbourhood
@@ -193,6 +193,11 @@ def statistical(points: ArrayLike, params: Statistical | None = None) -> Selecti
         ``removal_margin`` (n,): the same as a share of the cut, above 1 for removed points; at
         most 1 for spared ones.
 
+    Raises
+    ------
+    InputError
+        `points` is not (n, 3) or not finite.
+
     Notes
     -----
     O(n log n). Tile class: two-pass (`Totals` add up over tiles).
@@ -235,17 +240,6 @@ def takes_places(taken: Taken, asked: Taken, cut: float) -> bool:
 def sparing_reach(cut: float) -> float | None:
     """Return how far the rule that spares looks, metres: thin surfaces lie beyond their cloud's."""
     return _REACH_CUTS * cut or None
-
-
-def spare(chosen: Selection, is_surface: Mask) -> Selection:
-    """Return the choice with the points (n,) that another rule keeps."""
-    is_spared = is_surface & ~chosen.is_kept
-    margin = chosen.attributes["removal_margin"]
-    return replace(
-        chosen,
-        is_kept=chosen.is_kept | is_spared,
-        attributes={**chosen.attributes, "removal_margin": np.where(is_spared, 1.0, margin)},
-    )
 
 
 def spared_notes(spared: int, beyond: int) -> tuple[str, ...]:

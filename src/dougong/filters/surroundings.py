@@ -87,11 +87,23 @@ class Tested(NamedTuple):
     """(m, 2) links across the border: the group of own points, the place of a point of the halo."""
 
 
+def middle_rank(eighth_m: ValueBlocks, points: int) -> int | None:
+    """Return which of the eighth distances, ascending, is the middle one; None with too few.
+
+    Of points that lie apart: more than eight at one place, as scanners write missing returns, have
+    a distance of 0 and no spacing.
+    """
+    heaped = sum(int(np.count_nonzero(block == 0.0)) for block in eighth_m())
+    apart = points - heaped
+    return heaped + apart // 2 if apart > TESTS else None
+
+
 def reach_of(eighth_m: ValueBlocks, points: int) -> float:
     """Return the reach, metres, of a cloud of so many `points`, by their eighth nearest others."""
-    if points <= TESTS:
+    rank = middle_rank(eighth_m, points)
+    if rank is None:
         return REACH_M
-    spacing = at_rank(eighth_m, points // 2) * math.sqrt(math.pi / TESTS)
+    spacing = at_rank(eighth_m, rank) * math.sqrt(math.pi / TESTS)
     reach = REACH_M
     while reach < SPARSE * spacing:
         reach *= 2.0
@@ -138,8 +150,13 @@ def spacing_shown(eighth_m: Values, reach_m: float) -> Values:
     return spacing
 
 
-def test_cloud(index: Neighbourhood, reach_m: float | None, tests: Tests) -> tuple[Tested, float]:
-    """Test all points of a cloud; return what is found and the reach, given or found."""
+def test_cloud(
+    index: Neighbourhood, reach_m: float | None, tests: Tests, low: NDArray[np.float64]
+) -> tuple[Tested, float]:
+    """Test all points of a cloud; return what is found and the reach, given or found.
+
+    low (3,): where the cells of `local_spacing` begin.
+    """
     from dougong.kernels import protective as kernels
 
     n = len(index.points)
@@ -152,30 +169,37 @@ def test_cloud(index: Neighbourhood, reach_m: float | None, tests: Tests) -> tup
             _BLOCK,
             lambda start, stop: kernels.drop_far(index.points, places, reach**2, start, stop),
         )
-    spacing = local_spacing(index.points, spacing_shown(eighth, reach), reach, n)
+    spacing = local_spacing(index.points, spacing_shown(eighth, reach), reach, n, low)
     return _tested(index, places, spacing, n, is_all, reach, tests), reach
 
 
-def test_part(points: Points, eighth_m: Values, own: int, reach_m: float, tests: Tests) -> Tested:
+def test_part(
+    points: Points,
+    eighth_m: Values,
+    own: int,
+    reach_m: float,
+    tests: Tests,
+    low: NDArray[np.float64],
+) -> Tested:
     """Test the first `own` of the points (n, 3) of a part; the others are its halo.
 
-    eighth_m (n,): how far the eighth nearest other is, in the whole cloud.
+    eighth_m (n,): how far the eighth nearest other is, in the whole cloud. low (3,): of that.
     """
     from dougong.filters.neighbourhood import build_index
 
     if not own:
         return _nothing()
-    low, high = corners_of(points[:own])
+    lowest, highest = corners_of(points[:own])
     found = _FOUND * reach_m * SLACK
-    is_near = are_within(points, low - found, high + found)
+    is_near = are_within(points, lowest - found, highest + found)
     # What is farther has a say in the spacing only. Own points come first still.
     order = np.concatenate([np.flatnonzero(is_near), np.flatnonzero(~is_near)])
     near = int(is_near.sum())
     shown = spacing_shown(eighth_m[order], reach_m)
-    spacing = local_spacing(points[order], shown, reach_m, near)
+    spacing = local_spacing(points[order], shown, reach_m, near, low)
     index = build_index(points[order[:near]])
     reach = reach_m * SLACK
-    is_seen = are_within(index.points, low - reach, high + reach)
+    is_seen = are_within(index.points, lowest - reach, highest + reach)
     places, _ = _neighbours(index, reach_m, is_seen)
     tested = _tested(index, places, spacing[index.order], own, is_seen, reach_m, tests)
     tested.across[:, 1] = order[tested.across[:, 1]] - own

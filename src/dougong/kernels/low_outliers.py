@@ -221,6 +221,7 @@ def mark_low(
         if keys[i] < 0:
             continue
         column = keys[i] // levels
-        if points[i, 2] < floor[column]:
+        # Rounded, so that a point as high as the floor is not below it in some frame.
+        if rounded(points[i, 2], floor[column]) < 0.0:
             v = first_at_or_above(unique, starts[column], starts[column + 1], keys[i])
             out[i] = not is_level[v]

@@ -144,6 +144,55 @@ def _summary(ordered: Floats, use_median: bool) -> tuple[float, float]:
 
 
 @kernel
+def _along_axis(
+    points: Floats,
+    boxes: Floats,
+    core: Floats,
+    normal: Floats,
+    radius: float,
+    length: float,
+    reach: Floats,
+    stack: Ints,
+    held: Floats,
+) -> tuple[int, Floats]:
+    """Return how many points lie in a cylinder, and an array that begins with their positions.
+
+    Along its axis, from the core point. That array is `held` or, where it is too short, a new one.
+    """
+    n = points.shape[0]
+    leaves = boxes.shape[0] // 2
+    x, y, z = core[0], core[1], core[2]
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    count = 0
+    stack[0] = 1
+    height = 1
+    while height > 0:
+        height -= 1
+        node = stack[height]
+        if _is_apart(boxes, node, core, reach):
+            continue
+        if node < leaves:
+            stack[height] = 2 * node
+            stack[height + 1] = 2 * node + 1
+            height += 2
+            continue
+        leaf = node - leaves
+        for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
+            dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+            along = dx * nx + dy * ny + dz * nz
+            dx -= along * nx
+            dy -= along * ny
+            dz -= along * nz
+            if abs(along) > length or dx * dx + dy * dy + dz * dz > radius * radius:
+                continue
+            if count == held.shape[0]:
+                held = _grown(held)
+            held[count] = along
+            count += 1
+    return count, held
+
+
+@kernel
 def project(
     points: Floats,
     boxes: Floats,
@@ -165,46 +214,18 @@ def project(
     are filled; NaN where the cylinder is empty. Positions are sorted first, so that the sums do
     not depend on the order of the points.
     """
-    n = points.shape[0]
-    leaves = boxes.shape[0] // 2
-    radius2 = radius * radius
     stack = np.empty(_DEPTH, np.int64)
     reach = np.empty(3, np.float64)
     held = np.empty(_FIRST_ROOM, np.float64)
     for q in range(start, stop):
         counts[q] = 0
         middles[q] = spreads[q] = np.nan
-        x, y, z = cores[q, 0], cores[q, 1], cores[q, 2]
-        nx, ny, nz = normals[q, 0], normals[q, 1], normals[q, 2]
-        if not (nx == nx):
+        if not (normals[q, 0] == normals[q, 0]):
             continue
         _reach(normals[q], length, radius, reach)
-        count = 0
-        stack[0] = 1
-        height = 1
-        while height > 0:
-            height -= 1
-            node = stack[height]
-            if _is_apart(boxes, node, cores[q], reach):
-                continue
-            if node < leaves:
-                stack[height] = 2 * node
-                stack[height + 1] = 2 * node + 1
-                height += 2
-                continue
-            leaf = node - leaves
-            for i in range(leaf * n // leaves, (leaf + 1) * n // leaves):
-                dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
-                along = dx * nx + dy * ny + dz * nz
-                dx -= along * nx
-                dy -= along * ny
-                dz -= along * nz
-                if abs(along) > length or dx * dx + dy * dy + dz * dz > radius2:
-                    continue
-                if count == held.shape[0]:
-                    held = _grown(held)
-                held[count] = along
-                count += 1
+        count, held = _along_axis(
+            points, boxes, cores[q], normals[q], radius, length, reach, stack, held
+        )
         if count == 0:
             continue
         ordered = held[:count]

@@ -4,21 +4,22 @@ import numpy as np
 
 from dougong.kernels._arrays import Floats, Ints
 from dougong.kernels._jit import kernel
-
-_TIE_STEPS = float(1 << 40)
-"""Squared distances are compared in steps of voxel edge squared / 2**40, so that points which
-mirror each other about a centre tie whatever the rounding (common on quantised data)."""
+from dougong.kernels.cells import steps_from, steps_per_edge
 
 
 @kernel
-def centre_rank(points: Floats, i: int, low: Floats, voxel_m: float) -> int:
-    """Return how far point i lies from the centre of its voxel, squared, in steps (int64)."""
-    total = 0.0
+def centre_rank(points: Floats, i: int, low: Floats, step_m: float, steps: float) -> int:
+    """Return how far point i lies from the centre of its voxel of so many steps, squared.
+
+    In whole steps (see `cells`), so points that mirror each other about a centre tie, whatever the
+    rounding of the frame (common on quantised data).
+    """
+    total = 0
     for axis in range(3):
-        cell = (points[i, axis] - low[axis]) / voxel_m
-        off = cell - np.floor(cell) - 0.5
+        up = steps_from(points[i, axis], low[axis], step_m)
+        off = int(up - np.floor(up / steps) * steps - 0.5 * steps)
         total += off * off
-    return int(total * _TIE_STEPS + 0.5)
+    return total
 
 
 @kernel
@@ -40,16 +41,18 @@ def nearest_to_centres(
     smallest (x, y, z). Filled: chosen (runs,) a place in `points`; twins (runs,) how many points
     lie exactly where the chosen one does; counts (n,) the points of each point's voxel.
     """
+    steps = steps_per_edge(voxel_m)
+    step_m = voxel_m / steps
     for run in range(first_run, last_run):
         start, stop = run_starts[run], run_starts[run + 1]
         best = places[start]
-        best_rank = centre_rank(points, best, low, voxel_m)
+        best_rank = centre_rank(points, best, low, step_m, steps)
         same = 1
         counts[best] = stop - start
         for at in range(start + 1, stop):
             i = places[at]
             counts[i] = stop - start
-            rank = centre_rank(points, i, low, voxel_m)
+            rank = centre_rank(points, i, low, step_m, steps)
             if rank > best_rank:
                 continue
             order = 0

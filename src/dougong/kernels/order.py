@@ -8,6 +8,7 @@ import numpy as np
 
 from dougong.kernels._arrays import Floats, Ints, Keys
 from dougong.kernels._jit import kernel
+from dougong.kernels.cells import steps_from, steps_per_edge
 
 KEY_BITS = 21
 """Bits per axis: cells 0 .. 2**21 - 1."""
@@ -32,14 +33,16 @@ def morton_keys(
 ) -> None:
     """Fill out[start:stop] with the Morton key of the cell of each point.
 
-    points (n, 3), low (3,) low corner, cell_m edge of a cell; out (n,) uint64. Cells outside
-    0 .. 2**21 - 1 are clamped to the border, so the caller must know what a clamped key means.
+    points (n, 3), low (3,) low corner, cell_m edge of a cell (see `cells`); out (n,) uint64. Cells
+    outside 0 .. 2**21 - 1 are clamped to the border, so the caller must know what such a key means.
     """
     top = float((1 << KEY_BITS) - 1)
+    steps = steps_per_edge(cell_m)
+    step_m, per_step = cell_m / steps, 1.0 / steps
     for i in range(start, stop):
         key = np.uint64(0)
         for axis in range(3):
-            cell = np.floor((points[i, axis] - low[axis]) / cell_m)
+            cell = np.floor(steps_from(points[i, axis], low[axis], step_m) * per_step)
             cell = min(max(cell, 0.0), top)
             key |= spread(np.uint64(cell)) << np.uint64(axis)
         out[i] = key
@@ -53,6 +56,8 @@ def radix_argsort(keys: Keys, bits: int, order: Ints, spare_order: Ints, spare_k
     Least significant digit first; a pass whose digit is the same everywhere is skipped.
     """
     n = keys.shape[0]
+    if n == 0:
+        return
     counts = np.empty(_BUCKETS, np.int64)
     mask = np.uint64(_BUCKETS - 1)
     for shift in range(0, bits, _DIGIT):

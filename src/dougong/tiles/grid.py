@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong._sorting import keys_of_rows
+from dougong.filters.octree_voxel_grid import cells_of
 from dougong.typing import Index, Points
 
 MOST_LEVELS = 40
@@ -59,11 +60,9 @@ def grid_for(
 
 def part(points: Points, grid: TileGrid) -> Parts:
     """Sort `points` (n, 3), local metres, by the tile whose voxels they lie in."""
-    # The same division and floor as the voxels' own: no rounding can part a voxel.
-    columns = [
-        np.floor((points[:, axis] - grid.low[axis]) / grid.voxel_m).astype(np.int64) >> grid.level
-        for axis in range(3)
-    ]
+    # The voxels' own rule: no rounding can part a voxel.
+    voxels = cells_of(points, grid.low, grid.voxel_m)
+    columns = [voxels[:, axis].astype(np.int64) >> grid.level for axis in range(3)]
     keys = _keys(columns)
     order = np.argsort(keys, kind="stable") if keys is not None else np.lexsort(columns[::-1])
     is_first = np.zeros(len(points), np.bool_)

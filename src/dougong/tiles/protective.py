@@ -14,8 +14,8 @@ from dougong.filters.curvature_weighted import CurvatureWeighted, protective_cho
 from dougong.filters.groups import sizes_of
 from dougong.filters.neighbourhood import build_index
 from dougong.filters.protective import Doubtful, row_halo_m, rows_excused
-from dougong.filters.selection import Reason
-from dougong.filters.statistical import nearest_distances, select_near, spare
+from dougong.filters.selection import Reason, spare
+from dougong.filters.statistical import nearest_distances, select_near
 from dougong.filters.surroundings import HALO, SLACK, TESTS, Taken, test_part
 from dougong.tiles import things
 from dougong.tiles.cloud import POINTS, Arrays, Record, Tile, read_arrays, read_file
@@ -34,15 +34,16 @@ def eighth_within(job: Job) -> tuple[Arrays, Record]:
 
 
 def test_points(job: Job) -> tuple[Arrays, Record]:
-    """Test a tile's points; known: the step of `eighth_within`, and the reach.
+    """Test a tile's points; known: the step of `eighth_within`, the reach, the low corner.
 
     Leaves of every point what the tests say and its group, and tables of the groups, of the links
     across the border, and of the points that may go.
     """
     assert isinstance(job.params, CurvatureWeighted)
-    step, reach = job.known
+    step, reach, low = job.known
     part = with_halo(job, HALO * reach * SLACK, step=step, found="largest")
-    tested = test_part(part.points, part.more["largest"], part.own, reach, job.params.tests)
+    eighth, tests = part.more["largest"], job.params.tests
+    tested = test_part(part.points, eighth, part.own, reach, tests, np.array(low))
     own = part.points[: part.own]
     sizes = sizes_of(own, tested.spacing_m, tested.curvature, tested.group)
     place = protective.doubtful_of(tested, sizes.are_large(reach))

@@ -22,6 +22,7 @@ from dougong.filters.concentration import note_of, tally, together
 from dougong.filters.curvature_weighted import CurvatureWeighted
 from dougong.filters.lost_places import lost_places
 from dougong.filters.low_outliers import LowOutliers, find_levels, low_notes
+from dougong.filters.octree_voxel_grid import robust_box_of
 from dougong.filters.pass_through import PassThrough, robust_top_of, unknown_notes
 from dougong.filters.protective import is_too_few
 from dougong.filters.radius import Radius
@@ -35,7 +36,7 @@ from dougong.filters.statistical import (
     stray_notes,
     takes_places,
 )
-from dougong.filters.surroundings import REACH_M, TESTS, reach_of
+from dougong.filters.surroundings import REACH_M, middle_rank, reach_of
 from dougong.filters.totals import Totals
 from dougong.filters.wires import are_rows
 from dougong.params import Parameters
@@ -169,6 +170,11 @@ class _Stage:
             job = Job(self.cloud.folder, tile, self.before, self.params, self.among)
             yield asked_points(job, tile)
 
+    def low(self) -> list[float]:
+        """Return where cells begin that tiles and the whole share: the cloud's `robust_low`."""
+        low: list[float] = robust_box_of(self.blocks, self.asked)[0].tolist()
+        return low
+
     def lost_places(self, after: str) -> tuple[str, ...]:
         """Return what is to be said where this stage, which left the state `after`, took places."""
         origin = np.array(self.cloud.facts["origin"])
@@ -299,12 +305,12 @@ def _curvature_weighted(stage: _Stage) -> Outcome:
     assert isinstance(stage.params, CurvatureWeighted)
     if stage.params.rule == "protective":
         return _protective(stage)
-    known = None
+    low, of_all = stage.low(), None
     if stage.params.rule == "global":
-        counted, _ = stage.map("totals", work.count_curvature)
+        counted, _ = stage.map("totals", work.count_curvature, low)
         totals = sum((Totals(*record["totals"]) for record in counted), Totals())
-        known = (totals.count, totals.total, totals.squares)
-    records, key = stage.map("curvature_weighted", work.judge_curvature, known)
+        of_all = (totals.count, totals.total, totals.squares)
+    records, key = stage.map("curvature_weighted", work.judge_curvature, (low, of_all))
     return records, (), key
 
 
@@ -321,7 +327,7 @@ def _protective_found(seen: _Stage) -> tuple[str, str | None, float]:
     assert isinstance(seen.params, CurvatureWeighted)
     reach_m = seen.params.reach_m
     reach, eighth = _reach(seen, seen.params)
-    _, tested = seen.map("surroundings", protective.test_points, (eighth, reach))
+    _, tested = seen.map("surroundings", protective.test_points, (eighth, reach, seen.low()))
     judged = None
     if not is_too_few(seen.asked, reach_m):
         judged = _hovering(seen, tested, reach, is_whole=reach_m is None)
@@ -357,7 +363,8 @@ def _reach(stage: _Stage, params: CurvatureWeighted) -> tuple[float, str]:
     while True:
         _, found = stage.map("eighth", protective.eighth_within, within)
         eighth = stage.values(found, "largest")
-        if stage.asked <= TESTS or count_finite(eighth) > stage.asked // 2:
+        rank = middle_rank(eighth, stage.asked)
+        if rank is None or count_finite(eighth) > rank:
             reach = reach_of(eighth, stage.asked)
             if reach <= within:
                 return reach, found

@@ -17,6 +17,7 @@ from dougong.filters.clutter import Clutter, clutter
 from dougong.filters.clutter import halo_m as clutter_halo_m
 from dougong.filters.curvature_weighted import (
     CurvatureWeighted,
+    Whole,
     curvature_weighted,
     own_totals,
 )
@@ -128,24 +129,28 @@ def judge_pass_through(job: Job) -> tuple[Arrays, Record]:
 
 
 def judge_curvature(job: Job) -> tuple[Arrays, Record]:
-    """CWASF, rules paper and global; known: the totals of rule global, or None."""
+    """CWASF, rules paper and global; known: the low corner, and the totals of global or None."""
     assert isinstance(job.params, CurvatureWeighted)
     part = with_halo(job, curvature_halo_m(job.params), more=("voxel_count",))
     found = curvature_weighted(
         part.points,
         job.params,
         voxel_count=part.more.get("voxel_count"),
-        whole=None if job.known is None else Totals(*job.known),
+        whole=_whole(*job.known),
     )
     return booked(job, _own(found, part.own), Reason.CURVATURE_WEIGHTED)
 
 
 def count_curvature(job: Job) -> tuple[Arrays, Record]:
-    """Count what a tile adds to the statistics of CWASF's rule global."""
+    """Count what a tile adds to the statistics of CWASF's rule global; known: the low corner."""
     assert isinstance(job.params, CurvatureWeighted)
     part = with_halo(job, curvature_halo_m(job.params))
-    totals = own_totals(part.points, job.params, part.own)
+    totals = own_totals(part.points, job.params, part.own, _whole(job.known))
     return {}, {"totals": [totals.count, totals.total, totals.squares]}
+
+
+def _whole(low: list[float], totals: tuple[int, int, int] | None = None) -> Whole:
+    return Whole(np.array(low), None if totals is None else Totals(*totals))
 
 
 def mean_within(job: Job) -> tuple[Arrays, Record]:
