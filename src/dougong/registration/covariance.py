@@ -26,7 +26,7 @@ _FACING_OF_BLOCK = 0.02
 # Fewer are enough where this share of all the weight does.
 _LEAST_FACING_SHARE = 0.004
 _LEAST_FACING_BLOCKS = 3
-_BEFORE = (0.25, 0.25, 0.0)
+_BEFORE = np.array([0.25, 0.25, 0.0])
 _DRAWS = 1000
 _DRAWN_POINTS = 400
 
@@ -54,7 +54,10 @@ def _cells(points: Points, size_m: float) -> NDArray[np.int64]:
     sigma differed tenfold by that. In plan the first begins a quarter of an edge before them, else
     borders run along the walls at the corner.
     """
-    return np.floor((points - points.min(axis=0)) / size_m + _BEFORE).astype(np.int64)
+    cells: NDArray[np.int64] = np.floor((points - points.min(axis=0)) / size_m + _BEFORE).astype(
+        np.int64
+    )
+    return cells
 
 
 class Jackknife(NamedTuple):
