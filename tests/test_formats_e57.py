@@ -171,6 +171,41 @@ def test_chunks_are_the_whole(two_stations, chunk):
     assert np.array_equal(parts[0].frame.origin, stations[0].frame.origin)
 
 
+@pytest.mark.parametrize("chunk", [700, 100_000])
+def test_chunks_of_all_scans_as_one_cloud_are_those_of_the_whole(two_stations, tmp_path, chunk):
+    world, path, scans = two_stations
+    # Another layout, an unusable row, and a scan in between of which no point is left.
+    own = {name: values[:900] for name, values in scans[1]["fields"].items() if name != "rowIndex"}
+    state = np.zeros(900, "i1")
+    state[40] = 2
+    other = {**scans[1], "name": "other", "fields": {**own, "cartesianInvalidState": state}}
+    nothing = {**cartesian(world[:50]), "cartesianInvalidState": np.full(50, 2, "i1")}
+    mixed = write_e57(tmp_path / "mixed.e57", [scans[0], {"fields": nothing}, other])
+    alone = write_e57(tmp_path / "alone.e57", [{"fields": nothing}, other])
+    for file in (path, mixed, alone):
+        whole, parts = read(file), list(iterate(file, chunk, as_one=True))
+        for name in ("xyz", "records"):
+            found = np.concatenate([getattr(part, name) for part in parts])
+            np.testing.assert_array_equal(found, getattr(whole, name))
+        for part in parts:
+            assert (part.name, part.notes) == (whole.name, whole.notes)
+            np.testing.assert_array_equal(part.viewpoints, whole.viewpoints)
+            assert part.header.station == whole.header.station
+            stations = [scan.station for scan in part.header.stations]
+            assert stations == [scan.station for scan in whole.header.stations]
+
+
+def test_where_the_scanner_stood_is_known(two_stations):
+    _, path, scans = two_stations
+    stood = [scan["translation"] for scan in scans]
+    whole = read(path)
+    assert np.abs(whole.viewpoints + whole.frame.origin - stood).max() < 1e-9
+    for cloud, place in zip(read_stations(path), stood, strict=True):
+        assert np.abs(cloud.viewpoints + cloud.frame.origin - place).max() < 1e-9
+    (_, second) = whole.viewpoints + whole.frame.origin
+    np.testing.assert_allclose(second, [500_001.0, 4_000_000.0, 21.5])
+
+
 def test_describe_counts_stations(two_stations):
     world, path, _ = two_stations
     info = describe(path)

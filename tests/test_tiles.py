@@ -22,6 +22,7 @@ from dougong.tiles.grid import TileGrid, grid_for, leaves_of, part
 from dougong.tiles.partition import partition
 from dougong.tiles.spool import Spool
 from dougong.tiles.store import RowFile, Rows
+from e57_surveys import survey
 from tile_scans import KILLED, VOXEL, filtered_by, make_little_room, site, write_scan
 
 
@@ -194,6 +195,20 @@ def test_filter_is_the_same_on_tiles(scan, tmp_path, little_room, what):
         del stage["seconds"]
     assert told == said
     assert not list(tmp_path.glob("tiles-*"))
+
+
+def test_filter_of_a_survey_is_the_same_on_tiles(tmp_path, little_room):
+    survey(tmp_path / "scans.e57", scans=2, rows=150, columns=150, kind="double")
+    file, only = tmp_path / "scans.e57", ("--only", "pass_through")
+    only += ("--set", "pass_through.z_m=[0, 40]")
+    whole, said = filtered_by(file, tmp_path / "a.e57", *only, "--memory", "4GB")
+    tiled, told = filtered_by(file, tmp_path / "b.e57", *only, "--memory", "190kB")
+    assert [scan.station for scan in tiled.header.stations] == [0, 1]
+    np.testing.assert_array_equal(tiled.xyz, whole.xyz)
+    np.testing.assert_array_equal(tiled.records, whole.records)
+    np.testing.assert_array_equal(tiled.viewpoints, whole.viewpoints)
+    assert told["notes"] == said["notes"]
+    assert told["reasons"] == said["reasons"]
 
 
 def test_run_is_the_same_on_tiles_and_goes_on_where_it_was(

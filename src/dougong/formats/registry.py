@@ -7,10 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from dougong.cloud import Cloud, Pieces, in_pieces, joined_pieces
 from dougong.errors import FormatError, FrameError, InputError, OutputError
+from dougong.formats.joined_scans import chunks_as_one, joined_scans
 from dougong.formats.model import Hold, Written
 from dougong.formats.remembered import Remembered
 from dougong.formats.stream import (
@@ -19,6 +18,7 @@ from dougong.formats.stream import (
     iterate_scans,
     opened,
     read_scans,
+    scans_without_points,
     stem_of,
     survey_of,
 )
@@ -161,58 +161,23 @@ def read(path: Path | str) -> Cloud:
     """
     path = Path(path)
     clouds = read_stations(path)
-    if len(clouds) == 1 and getattr(clouds[0].header, "station", 0) == 0:
-        return clouds[0]
-    return _merged_stations(clouds, path)
+    return joined_scans(clouds, path) if _is_survey(clouds) else clouds[0]
 
 
-def _merged_stations(clouds: Sequence[Cloud], path: Path) -> Cloud:
-    marked = [
-        cloud.with_attribute("station", np.full(len(cloud), cloud.header.station, dtype="<u2"))
-        for cloud in clouds
-    ]
-    layout: dict[str, Any] = {}
-    for cloud in marked:
-        for name in cloud.records.dtype.names or ():
-            kind = cloud.records.dtype[name]
-            layout[name] = np.promote_types(layout[name], kind) if name in layout else kind
-    records = np.zeros(sum(map(len, marked)), dtype=list(layout.items()))
-    xyz = np.empty((len(records), 3))
-    at = 0
-    missing: set[str] = set()
-    for cloud in marked:
-        part = slice(at, at + len(cloud))
-        xyz[part] = cloud.xyz
-        for name in layout:
-            if name in (cloud.records.dtype.names or ()):
-                records[name][part] = cloud.records[name]
-            else:
-                missing.add(name)
-        at += len(cloud)
-    notes = [f"{cloud.name}: {note}" for cloud in clouds for note in cloud.notes]
-    notes += [f"{name} is 0 for stations without it." for name in sorted(missing)]
-    headers = tuple(cloud.header for cloud in clouds)
-    places = np.full((1 + max(cloud.header.station for cloud in clouds), 3), np.nan)
-    for cloud in clouds:
-        if cloud.viewpoints is not None:
-            places[cloud.header.station] = cloud.viewpoints[0]
-    return replace(
-        clouds[0],
-        xyz=xyz,
-        records=records,
-        viewpoints=places,
-        name=stem_of(path),
-        header=replace(headers[0], stations=headers),
-        notes=tuple(notes),
-    )
+def _is_survey(scans: Sequence[Cloud | Scan]) -> bool:
+    """Say whether the one cloud of a file's scans tells them apart."""
+    return len(scans) > 1 or any(getattr(scan.header, "station", 0) for scan in scans)
 
 
-def iterate(path: Path | str, chunk_points: int = 1_000_000) -> Iterator[Cloud]:
+def iterate(
+    path: Path | str, chunk_points: int = 1_000_000, *, as_one: bool = False
+) -> Iterator[Cloud]:
     """Yield a file in clouds of at most `chunk_points` points that share one frame.
 
     The file is never held as a whole (PCD binary_compressed is one block by design: it is).
     All but LAS are passed over twice, once where that was done before and is remembered. Scans of
-    an E57 or PTX file follow one another; `cloud.header.station` tells them apart.
+    an E57 or PTX file follow one another; `cloud.header.station` tells them apart. With `as_one`
+    the chunks are those of the one cloud that `read` returns.
 
     Raises
     ------
@@ -227,12 +192,17 @@ def iterate(path: Path | str, chunk_points: int = 1_000_000) -> Iterator[Cloud]:
         from dougong.formats import las
 
         return las.iterate(path, chunk_points)
-    return _surveyed(path, scans_of(path, kind), chunk_points)
+    return _surveyed(path, scans_of(path, kind), chunk_points, as_one=as_one)
 
 
-def _surveyed(path: Path, scans: list[Scan], rows: int) -> Iterator[Cloud]:
+def _surveyed(path: Path, scans: list[Scan], rows: int, *, as_one: bool) -> Iterator[Cloud]:
     # A generator: the pass is made when the first cloud is asked for.
-    yield from iterate_scans(scans, rows, file_survey(path, scans))
+    survey = file_survey(path, scans)
+    chunks = iterate_scans(scans, rows, survey)
+    if len(scans) == 1:
+        chunks = (replace(chunk, name=stem_of(path)) for chunk in chunks)
+    empty = scans_without_points(scans, survey) if as_one and _is_survey(scans) else []
+    yield from chunks_as_one(chunks, empty, path) if _is_survey(empty) else chunks
 
 
 def family_of(path: Path) -> str:

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-import numpy as np
-
 from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.filters import FILTERS
@@ -73,17 +71,13 @@ def stations_of(file: Path, *, split: bool) -> Iterator[Iterator[Cloud]]:
     ------
     FormatError
         The file cannot be read.
-    InputError
-        Its scans are wanted as one cloud, but have different attributes.
     """
+    if not split:
+        yield decoded(file)
+        return
     chunks = iterate(file, CHUNK_POINTS)
-    if split:
-        for _, group in groupby(chunks, lambda cloud: getattr(cloud.header, "station", 0)):
-            yield group
-    elif len_stations(file) > 1:
-        yield _marked_with_station(chunks, file)
-    else:
-        yield chunks
+    for _, group in groupby(chunks, lambda cloud: getattr(cloud.header, "station", 0)):
+        yield group
 
 
 def decoded(file: Path) -> Iterator[Cloud]:
@@ -91,33 +85,10 @@ def decoded(file: Path) -> Iterator[Cloud]:
 
     Raises
     ------
-    FormatError, InputError
+    FormatError
         As `stations_of`.
     """
-    (chunks,) = stations_of(file, split=False)
-    return chunks
-
-
-def len_stations(file: Path) -> int:
-    """Return how many scans a file keeps apart."""
-    return describe(file).stations if file.suffix.lower() in (".e57", ".ptx") else 1
-
-
-def _marked_with_station(chunks: Iterator[Cloud], file: Path) -> Iterator[Cloud]:
-    """Give each point its station, as the whole file's reader does; all scans need one layout."""
-    layout = None
-    for chunk in chunks:
-        station = np.full(len(chunk), chunk.header.station, dtype="<u2")
-        marked = chunk.with_attribute("station", station)
-        layout = layout or marked.records.dtype
-        if marked.records.dtype != layout:
-            msg = (
-                f"{file.name} is larger than the memory that may be used, and its stations have "
-                "different attributes, which tiles cannot join. Set registered = false for it, "
-                "or raise --memory."
-            )
-            raise InputError(msg)
-        yield marked
+    return iterate(file, CHUNK_POINTS, as_one=True)
 
 
 def filter_chunks(
