@@ -5,7 +5,16 @@ import pytest
 from pye57 import libe57
 
 from dougong.errors import FormatError
-from dougong.formats import check, describe, iterate, read, read_stations, write
+from dougong.formats import (
+    check,
+    describe,
+    in_system,
+    iterate,
+    read,
+    read_stations,
+    units_of,
+    write,
+)
 
 
 def quaternion(yaw, pitch=0.0):
@@ -373,3 +382,15 @@ def test_coordinates_are_metres_even_where_the_system_is_in_feet(tmp_path, crs):
     again = read(tmp_path / "a.laz")
     assert again.frame.unit_m == (1.0, 1.0, 1.0)
     np.testing.assert_allclose(again.frame.to_file(again.xyz), points, atol=1e-4)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:2277", "EPSG:2277+6360"])
+@pytest.mark.parametrize("named", ["", "EPSG:2277"])
+def test_coordinates_are_metres_even_where_a_system_in_feet_is_given(tmp_path, crs, named):
+    points = np.random.default_rng(3).uniform(0, 50, (40, 3)) + [950_000, 3_050_000, 150]
+    plain = read(write_e57(tmp_path / "a.e57", [{"fields": cartesian(points)}], named and crs))
+    cloud = in_system(plain, crs)
+    np.testing.assert_array_equal(cloud.xyz, plain.xyz)
+    assert cloud.frame.unit_m == (1.0, 1.0, 1.0)
+    assert units_of(cloud.frame.crs).unit_m == (1.0, 1.0, 1.0)
+    assert any("metres by definition: taken as metres" in note for note in cloud.notes)

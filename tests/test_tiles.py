@@ -14,6 +14,7 @@ from dougong.cloud import Cloud
 from dougong.errors import OutputError
 from dougong.filters.octree_voxel_grid import OctreeVoxelGrid, octree_voxel_grid, robust_box
 from dougong.formats import faults_of, read
+from dougong.pipeline import memory
 from dougong.threads import set_threads
 from dougong.tiles.cloud import read_arrays
 from dougong.tiles.engine import set_engine
@@ -227,6 +228,44 @@ def test_run_is_the_same_on_tiles_and_goes_on_where_it_was(
     assert len({result["result_hash"] for result in results}) == 1
     assert results[0]["notes"] == results[1]["notes"] == results[2]["notes"]
     assert results[1]["inputs"] == results[0]["inputs"]
+
+
+def test_tiles_of_another_unit_are_not_gone_on_with(tmp_path, little_room, monkeypatch):
+    monkeypatch.setattr("dougong.app._build_report", lambda *_: None)
+    write_scan(tmp_path / "scan.laz", 17_000)
+
+    def stages(crs, work):
+        told = f'[[cloud]]\nname = "scan"\nkind = "lidar"\nfiles = ["scan.laz"]\ncrs = "{crs}"\n'
+        (tmp_path / "p.toml").write_text(told)
+        tokens = ["run", str(tmp_path / "p.toml"), "--out", str(tmp_path / "out"), "--overwrite"]
+        tokens += ["--work", str(tmp_path / work), "--memory", "110kB", "--quiet"]
+        assert call(tokens) == 0
+        (cloud,) = json.loads((tmp_path / "out" / "result.json").read_text())["clouds"]
+        return [(stage["name"], stage["points_out"]) for stage in cloud["stages"]]
+
+    metres, feet = stages("EPSG:32650", "work"), stages("EPSG:2227", "work")
+    assert metres != feet
+    assert feet == stages("EPSG:2227", "other")
+
+
+def test_tiles_are_gone_on_with_whatever_is_free_at_the_moment(
+    scan, tmp_path, little_room, monkeypatch
+):
+    cut = []
+    known = Spool.__init__
+    monkeypatch.setattr(Spool, "__init__", lambda *args: (cut.append(1), known(*args))[1])
+    work = tmp_path / "work"
+
+    def run(*options):
+        filtered_by(scan, tmp_path / "out.laz", "--kind", "lidar", "--overwrite", *options,
+                    "--work", str(work))  # fmt: skip
+        return len(cut), len(list(work.glob("tiles-*")))
+
+    for free in (200_000, 185_000, 210_000):
+        monkeypatch.setattr(memory, "_free_bytes", lambda free=free: free)
+        assert run() == (1, 1)
+    assert run("--memory", "140kB") == (2, 1), "larger tiles than there is room for now"
+    assert run("--memory", "190kB") == (2, 1)
 
 
 @pytest.mark.filterwarnings("ignore")  # of the cluster's own

@@ -67,14 +67,6 @@ def kind_of(path: Path) -> str:
     return kind
 
 
-def has_metric_format(cloud: Cloud) -> bool:
-    """Say whether a cloud was read from a format whose lengths are metres by definition."""
-    from dougong.formats.e57 import E57Header
-    from dougong.formats.ptx import PtxHeader
-
-    return isinstance(cloud.header, E57Header | PtxHeader)
-
-
 def scans_of(path: Path, kind: str) -> list[Scan]:
     """Return the scans of a file that is not LAS."""
     if kind == "e57":

@@ -151,7 +151,7 @@ def filter_file(
     with clock.measure("read"):
         digest, stamp = identified(input)
     room = Room.of(memory_bytes)
-    with _places(output, work, f"{digest} {job.tiled().grid!r} in {room.bytes:.0f}") as places:
+    with _places(output, work, f"{digest} {job.tiled().grid!r}") as places:
         result: Cloud | Pieces
         if is_too_large(input, room, 0):
             progress.note(f"{input.name} is larger than memory: it is filtered on tiles")

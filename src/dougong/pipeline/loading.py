@@ -209,14 +209,19 @@ class Loader:
     def _tiles_key(self, entry: Entry, digest: str, station: int) -> str:
         """Return the name of the tiles: a hash of what they depend on, not of later filters."""
         grid = tiled_job(steps_of(entry.kind, self.recipe)).grid
-        facts = f"{digest} for {entry.kind} in {self.room.bytes:.0f}"
+        facts = f"{self._points(entry, digest)} for {entry.kind}"
         return self.store.key(facts, station, entry.kind, grid or Recipe())[:16]
 
     def _key(self, entry: Entry, digest: str, station: int) -> str:
         params = self.recipe.lidar if entry.kind == "lidar" else self.recipe.photogrammetry
-        digest += f" in {entry.crs}" if entry.crs is not None else ""
-        digest += f" at {self.units[entry.name]!r} m" if entry.name in self.units else ""
-        return self.store.key(digest, -1 if entry.registered else station, entry.kind, params)
+        station = -1 if entry.registered else station
+        return self.store.key(self._points(entry, digest), station, entry.kind, params)
+
+    def _points(self, entry: Entry, digest: str) -> str:
+        """Return what says where the points of a file are in metres: its hash, system and unit."""
+        system = f" in {entry.crs}" if entry.crs is not None else ""
+        unit = f" at {self.units[entry.name]!r} m" if entry.name in self.units else ""
+        return digest + system + unit
 
     def _say_known(self, name: str) -> None:
         self.progress.note(f"{name}: filtered in an earlier run; not filtered again")

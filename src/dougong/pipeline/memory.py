@@ -48,6 +48,15 @@ class Room:
         most = int(min(left / _BYTES_PER_TILE_POINT, _MOST_TILE_POINTS))
         return most if most >= LEAST_TILE_POINTS else None
 
+    def holds_tiles(self, points: int, waiting: int) -> bool:
+        """Say whether tiles that are there, `points` of which are worked on at once, fit.
+
+        What is free changes by the moment: where nobody said how much, all of it may be used
+        rather than the tiles be cut again.
+        """
+        most = self.bytes if self.is_asked else self.bytes / _SHARE
+        return tiles_bytes(points, waiting) <= most
+
     def held_points(self, waiting: int = 0) -> int:
         """Return how many points of an output may be held beside those that wait."""
         return self.most_tile_points(waiting) or LEAST_TILE_POINTS

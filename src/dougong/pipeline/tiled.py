@@ -123,7 +123,8 @@ def filter_chunks(
     waiting : int
         Points of clouds that are held meanwhile.
     folder : Folder
-        Gets the tiles. Those that an earlier run left there are gone on with.
+        Gets the tiles. Those that an earlier run left there are gone on with, if there is room for
+        tiles of their size.
     scratch : Path
         Gets the cloud and, while it is cut, its coordinates once more, then the books; may be the
         same folder.
@@ -139,7 +140,9 @@ def filter_chunks(
     start = time.perf_counter()
     with engine_in_use() as engine:
         tiles, spool = load_tiles(folder), None
-        if tiles is None:
+        if tiles is None or not room.holds_tiles(
+            tiles.facts["most_points"] * HALO_SHARE * engine.width, waiting
+        ):
             most = room.tile_points(points, waiting)
             kept = max(most // (HALO_SHARE * engine.width), 1)
             spool = _spooled(chunks, folder, scratch)
@@ -201,6 +204,7 @@ def _cut(
     told = {
         "name": first.name,
         "notes": list(first.notes),
+        "most_points": most_kept,
     }
     return partition(spool, job.grid, folder, most, most_kept, told)
 
