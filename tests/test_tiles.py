@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -246,6 +247,31 @@ def test_tiles_of_another_unit_are_not_gone_on_with(tmp_path, little_room, monke
     metres, feet = stages("EPSG:32650", "work"), stages("EPSG:2227", "work")
     assert metres != feet
     assert feet == stages("EPSG:2227", "other")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are not asked for elsewhere")
+@pytest.mark.parametrize("command", ["filter", "run"])
+def test_two_processes_do_not_cut_the_same_tiles(
+    scan, tmp_path, little_room, monkeypatch, capsys, command
+):
+    tokens = ["--work", str(tmp_path / "work"), "--memory", "190kB", "--quiet", "--overwrite"]
+    if command == "run":
+        monkeypatch.setattr("dougong.app._build_report", lambda *_: None)
+        tokens = ["run", "--lidar", str(scan), "--out", str(tmp_path / "out"), *tokens]
+    else:
+        tokens = ["filter", str(scan), str(tmp_path / "out.laz"), "--kind", "lidar", *tokens]
+    assert call(tokens) == 0
+    (tiles,) = (tmp_path / "work").glob("tiles-*")
+    before = sorted(tiles.iterdir())
+    for books in (tmp_path / "work").glob("*.books.*"):
+        books.unlink()
+    other = tiles.with_name(f"{tiles.name}.user-{platform.node()}-{os.getppid()}")
+    other.touch()
+    assert call(tokens) == 1
+    assert f"{tiles} is being worked in by another dougong" in capsys.readouterr().err
+    assert sorted(tiles.iterdir()) == before
+    other.unlink()
+    assert call(tokens) == 0
 
 
 def test_tiles_are_gone_on_with_whatever_is_free_at_the_moment(

@@ -2,6 +2,8 @@
 
 import importlib
 import json
+import os
+import platform
 import subprocess
 import sys
 
@@ -26,6 +28,23 @@ def scan(tmp_path):
 @pytest.fixture
 def little_room(monkeypatch):
     make_little_room(monkeypatch)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are not asked for elsewhere")
+def test_the_next_process_clears_what_a_killed_one_had_begun(tmp_path):
+    killed = (
+        "import os, sys; from pathlib import Path; from dougong.tiles.folder import LocalFolder\n"
+        "LocalFolder(Path(sys.argv[1])).write('0_0.points.npz', lambda _: os._exit(9))"
+    )
+    subprocess.run([sys.executable, "-c", killed, str(tmp_path)], check=False)
+    (left,) = tmp_path.iterdir()
+    theirs = tmp_path / f"0_1.points.npz.part-{platform.node()}-{os.getppid()}"
+    theirs.touch()
+    folder = LocalFolder(tmp_path)
+    for name in ("1_1.points.npz", "0_0.points.npz"):
+        folder.write(name, lambda file: file.write(b"whole"))
+        assert not left.exists()
+    assert folder.names() == {"0_0.points.npz", "1_1.points.npz", theirs.name}
 
 
 @pytest.mark.parametrize("kind", ["disk", "memory", "s3"])

@@ -342,14 +342,18 @@ def write_las_records(
     from dougong.formats.atomic import replacing
     from dougong.formats.copc import HELD_POINTS, CopcWriter
     from dougong.formats.las_write import LasWriter
+    from dougong.formats.unfinished import passing_folder
     from dougong.threads import ahead
 
     # Compressed points take about half; only named in the message of a full disk.
     expected = header.point_bytes * points // (1 if family == ".las" else 2)
-    with replacing(path, expected_bytes=expected + 65536) as sink:
+    most, place = hold or (HELD_POINTS, path.parent)
+    with (
+        replacing(path, expected_bytes=expected + 65536) as sink,
+        passing_folder(place / f"copc-{path.name}-") as scratch,
+    ):
         writer: CopcWriter | LasWriter
         if family == ".copc.laz":
-            most, scratch = hold or (HELD_POINTS, path.parent)
             writer = CopcWriter(sink, header, scratch=scratch, most_points=most)
         else:
             writer = LasWriter(sink, header, is_compressed=family == ".laz")

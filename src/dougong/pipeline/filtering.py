@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,11 +20,12 @@ from dougong.formats import (
     write,
 )
 from dougong.formats.model import Hold
+from dougong.formats.unfinished import passing_folder, sole_user, watched
 from dougong.params import Parameters
 from dougong.pipeline.books import Books, Tally
 from dougong.pipeline.marking import GROUND_CLASS, marked, marks_clutter, with_classes, with_clutter
 from dougong.pipeline.memory import Room
-from dougong.pipeline.outputs import finite, passing_folder, refuse_output, watched, write_json
+from dougong.pipeline.outputs import finite, refuse_output, write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import (
     Clock,
@@ -205,7 +206,8 @@ def _places(output: Path, work: Folder | None, facts: str) -> Iterator[_Places]:
         writing = beside / "written"
         writing.mkdir(parents=True)
         try:
-            with copies_in(beside / "copies"):
+            alone = nullcontext() if folder.local is None else sole_user(folder.local)
+            with alone, copies_in(beside / "copies"):
                 yield _Places(tiles=folder, scratch=scratch, writing=writing)
         finally:
             remove_spool(scratch)

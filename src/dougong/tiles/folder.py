@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, Protocol
 
 from dougong.errors import OutputError
-from dougong.formats.unfinished import part_of
+from dougong.formats.unfinished import clear_all_parts, part_of
 
 Fill = Callable[[IO[bytes]], object]
 """Writes what a file shall hold."""
@@ -109,6 +109,7 @@ class LocalFolder:
         part = part_of(path)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
+            clear_all_parts(self.path)
             with part.open("wb") as file:
                 fill(file)
                 file.flush()
