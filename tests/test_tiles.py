@@ -213,6 +213,18 @@ def test_filter_of_a_survey_is_the_same_on_tiles(tmp_path, little_room):
     assert told["reasons"] == said["reasons"]
 
 
+@pytest.mark.parametrize("mark", [(), ("--mark",)])
+def test_a_survey_that_is_too_large_to_be_written_is_refused(tmp_path, little_room, capsys, mark):
+    file = survey(tmp_path / "scans.e57", scans=2, rows=150, columns=150, kind="double")
+    tokens = ["filter", str(file), str(tmp_path / "a.e57"), "--only", "pass_through", *mark]
+    tokens += ["--memory", "190kB", "--quiet"]
+    assert call(tokens) == 2
+    said = capsys.readouterr().err
+    assert "a.e57 is held as a whole while it is written" in said
+    assert "more than --memory 0.0 GB" in said
+    assert list(tmp_path.iterdir()) == [file]
+
+
 def test_run_is_the_same_on_tiles_and_goes_on_where_it_was(
     scan, tmp_path, little_room, capsys, monkeypatch
 ):

@@ -226,7 +226,7 @@ def write(
     Parameters
     ----------
     cloud : Cloud or Pieces
-        A cloud that comes in pieces is never held as a whole, unless as E57 or PLY.
+        A cloud that comes in pieces is never held as a whole, unless as E57.
     notes : sequence of str, optional
         Put in front of the notes returned.
     hold : Hold, optional
@@ -246,11 +246,16 @@ def write(
     pieces = in_pieces(cloud)
     first = next(iter(pieces()))
     refuse_bad_target(path, overwrite=overwrite, source=getattr(first.header, "source", None))
-    if family in (".e57", ".ply"):
-        return _write_whole(joined_pieces(pieces), path, family, notes or ())
+    if family == ".ply":
+        return _write_ply(pieces, path, notes or ())
+    if family == ".e57":
+        whole = joined_pieces(pieces)
+        if not len(whole):
+            raise _none_left(whole.name, path)
+        return _write_e57([whole], path, notes or ())
     form = las_form(pieces, modern=family == ".copc.laz", packed=family == ".laz")
     if not form.points:
-        raise OutputError(f"{form.name} has no points left, so {path.name} was not written.")
+        raise _none_left(form.name, path)
     records = (form.records(piece) for piece in pieces())
     write_las_records(path, family, form.header, records, points=form.points, hold=hold)
     return Written(
@@ -261,19 +266,27 @@ def write(
     )
 
 
-def _write_whole(cloud: Cloud, path: Path, family: str, notes: Sequence[str]) -> Written:
-    """Write a cloud as E57 or PLY."""
-    if not len(cloud):
-        raise OutputError(f"{cloud.name} has no points left, so {path.name} was not written.")
-    if family == ".e57":
-        return _write_e57([cloud], path, notes)
-    from dougong.formats.atomic import replacing
-    from dougong.formats.ply_write import ply_parts, write_ply
+def _none_left(name: str, path: Path) -> OutputError:
+    return OutputError(f"{name} has no points left, so {path.name} was not written.")
 
-    head, records, said = ply_parts(cloud)
-    with replacing(path, expected_bytes=len(head) + records.nbytes) as sink:
-        write_ply(sink, head, records)
-    return Written(path=path, points=len(records), bytes=path.stat().st_size, notes=(*notes, *said))
+
+def _write_ply(pieces: Pieces, path: Path, notes: Sequence[str]) -> Written:
+    from dougong.formats.atomic import replacing
+    from dougong.formats.ply_write import ply_parts, whole_of, write_vertices
+
+    whole, sample = whole_of(pieces)
+    if not whole.points:
+        raise _none_left(sample.name, path)
+    head, (vertex,), said = ply_parts(sample, whole)
+    expected = len(head) + whole.points * vertex.dtype.itemsize
+    with replacing(path, expected_bytes=expected) as sink:
+        sink.write(head)
+        for piece in pieces():
+            _, records, more = ply_parts(piece, whole)
+            write_vertices(sink, records)
+            said += more
+    found = tuple(dict.fromkeys([*notes, *said]))
+    return Written(path=path, points=whole.points, bytes=path.stat().st_size, notes=found)
 
 
 def write_stations(

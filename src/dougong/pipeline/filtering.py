@@ -24,7 +24,7 @@ from dougong.formats.unfinished import passing_folder, sole_user, watched
 from dougong.params import Parameters
 from dougong.pipeline.books import Books, Tally
 from dougong.pipeline.marking import GROUND_CLASS, marked, marks_clutter, with_classes, with_clutter
-from dougong.pipeline.memory import Room
+from dougong.pipeline.memory import Room, refuse_whole_output
 from dougong.pipeline.outputs import finite, refuse_output, write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import (
@@ -156,8 +156,11 @@ def filter_file(
         result: Cloud | Pieces
         if is_too_large(input, room, 0):
             progress.note(f"{input.name} is larger than memory: it is filtered on tiles")
+            if mark:  # every point is written, whatever the filters take
+                refuse_whole_output(output, describe(input).points, room)
             with clock.measure("filter"):
                 books, again = _filtered_on_tiles(input, stamp, job, room, places, progress)
+            refuse_whole_output(output, books.points if mark else books.tally().kept, room)
             result = _pieces(again, job, books, mark)
         else:
             books, result = _filtered_whole(input, stamp, job, mark, clock, progress)

@@ -118,6 +118,23 @@ def estimated_bytes(points: Iterable[int]) -> int:
     return BASE_BYTES + counts[0] * BYTES_PER_POINT + sum(counts[1:]) * BYTES_PER_WAITING_POINT
 
 
+def refuse_whole_output(output: Path, points: int, room: Room) -> None:
+    """Refuse a file of `points` that is written as a whole and needs more than ``--memory``.
+
+    Raises
+    ------
+    InputError
+        It does.
+    """
+    if output.suffix.lower() == ".e57" and room.is_asked and not room.holds(points):
+        msg = (
+            f"{output.name} is held as a whole while it is written: {points:,} points need about "
+            f"{estimated_bytes([points]) / 1e9:.1f} GB, more than {room.name()}. Raise it, or "
+            "write .laz or .ply, which are written in pieces."
+        )
+        raise InputError(msg)
+
+
 def refuse_too_large(files: Iterable[Path], memory_bytes: int | None) -> None:
     """Refuse a job whose estimated need exceeds ``--memory``.
 
