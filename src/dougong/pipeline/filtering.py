@@ -20,6 +20,7 @@ from dougong.formats import (
     write,
 )
 from dougong.formats.model import Hold
+from dougong.formats.stream import stem_of
 from dougong.formats.unfinished import passing_folder, sole_user, watched
 from dougong.params import Parameters
 from dougong.pipeline.books import Books, Tally
@@ -169,7 +170,8 @@ def filter_file(
             with clock.measure("write"):
                 hold = Hold(room.held_points(), places.writing)
                 written = write(result, output, overwrite=overwrite, hold=hold)
-            notes = [*books.noticed, *books.notes, *written.notes]
+            said = [f"{stem_of(input)}, {note}" for note in books.notes]
+            notes = [*books.noticed, *said, *written.notes]
             document = {
                 "input": {"path": str(input), "sha256": digest, "points": books.points},
                 "output": str(output),

@@ -251,7 +251,10 @@ class Loader:
             stages=books.stages,
             points_in=books.points,
             removed=removed,
-            notes=(*(f"{file.name}: {note}" for note in books.noticed), *books.notes),
+            notes=(
+                *(f"{file.name}: {note}" for note in books.noticed),
+                *(f"{kept.name}, {note}" for note in books.notes),
+            ),
         )
 
 

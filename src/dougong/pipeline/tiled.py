@@ -171,7 +171,7 @@ def _run_steps(
             params = params.shifted(bench.cloud.facts["origin"])
         done = bench.apply(step.name, params, step.among)
         said = [*done.notes, *doubts(FILTERS[step.name].reason, done.taken, done.asked)]
-        notes += [f"{name}, {step.name}: {note}" for note in said]
+        notes += [f"{step.name}: {note}" for note in said]
         stages.append(
             StageCount(
                 name=step.name,
