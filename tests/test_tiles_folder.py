@@ -12,6 +12,7 @@ import pytest
 
 from dougong.cli import call
 from dougong.errors import InputError, OutputError
+from dougong.formats.unfinished import passing_folder, remove_unfinished
 from dougong.tiles import engine as engines
 from dougong.tiles.cloud import read_file, read_record, write_arrays
 from dougong.tiles.folder import LocalFolder
@@ -45,6 +46,19 @@ def test_the_next_process_clears_what_a_killed_one_had_begun(tmp_path):
         folder.write(name, lambda file: file.write(b"whole"))
         assert not left.exists()
     assert folder.names() == {"0_0.points.npz", "1_1.points.npz", theirs.name}
+
+
+def test_a_cancelled_job_does_not_make_its_folder_again(tmp_path):
+    """Its threads go on for a moment, and left tiles beside the output now and then."""
+    with passing_folder(tmp_path / "tiles-o-") as beside:
+        folder = LocalFolder(beside / "tiles")
+        folder.write("0_0.points.npz", lambda file: file.write(b"whole"))
+        remove_unfinished()
+        with pytest.raises(OutputError, match="the job was cancelled"):
+            folder.write("0_1.points.npz", lambda file: file.write(b"whole"))
+        assert not beside.exists()
+    with passing_folder(tmp_path / "tiles-o-"):
+        folder.write("0_1.points.npz", lambda file: file.write(b"whole"))
 
 
 @pytest.mark.parametrize("kind", ["disk", "memory", "s3"])

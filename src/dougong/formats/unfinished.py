@@ -18,6 +18,8 @@ from dougong.errors import OutputError
 _PART = ".part-"
 _ELSEWHERE = "Free some space or pass another --work."
 _begun: set[Path] = set()
+_removed: set[Path] = set()
+"""Of `_begun`, since the process is about to end."""
 
 
 def own_mark() -> str:
@@ -89,6 +91,7 @@ def clear_all_parts(folder: Path) -> None:
 def removed_if_cancelled(*paths: Path) -> Iterator[None]:
     """Have `paths` removed should the process be cancelled in the block."""
     _begun.update(paths)
+    _removed.difference_update(paths)
     try:
         yield
     finally:
@@ -104,8 +107,21 @@ def watched(*paths: Path) -> Iterator[None]:
 
 def remove_unfinished() -> None:
     """Remove what was being written. Called when the process is about to end at once."""
-    for path in list(_begun):
+    _removed.update(_begun)
+    for path in list(_begun) * 2:  # a thread may have been writing there the first time
         _remove(path)
+
+
+def refuse_removed(path: Path) -> None:
+    """Refuse to make anew what was removed: a thread may still be at it while the process ends.
+
+    Raises
+    ------
+    OutputError
+        `path` is, or is in, what was removed.
+    """
+    if any(path.is_relative_to(gone) for gone in _removed):
+        raise OutputError(f"{path} is not written any more: the job was cancelled.")
 
 
 @contextmanager
