@@ -1,6 +1,11 @@
 """COPC: read back by laspy, every point once, found by place and by level."""
 
+import contextlib
+import os
+import platform
 import struct
+import subprocess
+import sys
 
 import laspy
 import numpy as np
@@ -8,11 +13,12 @@ import pytest
 from laspy.copc import Bounds, CopcReader
 
 from dougong.cloud import Cloud
-from dougong.errors import FormatError
+from dougong.errors import FormatError, OutputError
 from dougong.formats import describe, iterate, read, write
 from dougong.formats.copc_nodes import LEAF_CAPACITY, priorities
 from dougong.formats.las_header import LasHeader
 from dougong.formats.model import Hold
+from dougong.formats.unfinished import own_mark, remove_unfinished
 from dougong.kernels.copc_levels import cube_codes, leaf_levels, pick_per_cell, priority
 from dougong.threads import get_threads, set_threads
 from reference.formats import cube_code
@@ -261,6 +267,33 @@ def test_cells_against_the_slow_twin():
     ours = np.array([priority(code) for code in wide])
     assert np.array_equal(ours, priorities(wide))
     assert abs(np.mean(ours / 2.0**64) - 0.5) < 0.03
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are not asked for elsewhere")
+def test_what_a_cancelled_or_killed_writer_held_on_disk_goes(tmp_path):
+    out = tmp_path / "a.copc.laz"
+    cloud = Cloud.from_points(np.random.default_rng(0).uniform(0, 10, (3 * LEAF_CAPACITY, 3)))
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        pass
+    dead = tmp_path / f"copc-{out.name}-{platform.node()}-{process.pid}"
+    dead.mkdir()
+    (dead / "points").write_bytes(b"of a killed one")
+    passes, seen = [], []
+
+    def pieces():
+        passes.append(1)
+        for start in range(0, len(cloud), 50_000):
+            yield cloud.select(np.arange(start, min(start + 50_000, len(cloud))))
+        seen.append({path.name for path in tmp_path.glob("copc-*")})
+        if len(passes) == 3:
+            remove_unfinished()
+            seen.append({path.name for path in tmp_path.glob("copc-*")})
+
+    with contextlib.suppress(OutputError):  # of a process that would have ended by now
+        write(pieces, out, hold=Hold(1, tmp_path))
+    assert seen[-2] == {f"copc-{out.name}-{own_mark()}"}
+    assert seen[-1] == set()
+    assert not list(tmp_path.glob("copc-*"))
 
 
 @pytest.mark.parametrize("far_m", [0.0, 3000.0])

@@ -5,7 +5,16 @@ import pytest
 from pye57 import libe57
 
 from dougong.errors import FormatError
-from dougong.formats import check, describe, iterate, read, read_stations, write
+from dougong.formats import (
+    check,
+    describe,
+    in_system,
+    iterate,
+    read,
+    read_stations,
+    units_of,
+    write,
+)
 
 
 def quaternion(yaw, pitch=0.0):
@@ -169,6 +178,41 @@ def test_chunks_are_the_whole(two_stations, chunk):
     assert {p.header.station for p in parts} == {0, 1}
     assert all(p.frame is parts[0].frame for p in parts)
     assert np.array_equal(parts[0].frame.origin, stations[0].frame.origin)
+
+
+@pytest.mark.parametrize("chunk", [700, 100_000])
+def test_chunks_of_all_scans_as_one_cloud_are_those_of_the_whole(two_stations, tmp_path, chunk):
+    world, path, scans = two_stations
+    # Another layout, an unusable row, and a scan in between of which no point is left.
+    own = {name: values[:900] for name, values in scans[1]["fields"].items() if name != "rowIndex"}
+    state = np.zeros(900, "i1")
+    state[40] = 2
+    other = {**scans[1], "name": "other", "fields": {**own, "cartesianInvalidState": state}}
+    nothing = {**cartesian(world[:50]), "cartesianInvalidState": np.full(50, 2, "i1")}
+    mixed = write_e57(tmp_path / "mixed.e57", [scans[0], {"fields": nothing}, other])
+    alone = write_e57(tmp_path / "alone.e57", [{"fields": nothing}, other])
+    for file in (path, mixed, alone):
+        whole, parts = read(file), list(iterate(file, chunk, as_one=True))
+        for name in ("xyz", "records"):
+            found = np.concatenate([getattr(part, name) for part in parts])
+            np.testing.assert_array_equal(found, getattr(whole, name))
+        for part in parts:
+            assert (part.name, part.notes) == (whole.name, whole.notes)
+            np.testing.assert_array_equal(part.viewpoints, whole.viewpoints)
+            assert part.header.station == whole.header.station
+            stations = [scan.station for scan in part.header.stations]
+            assert stations == [scan.station for scan in whole.header.stations]
+
+
+def test_where_the_scanner_stood_is_known(two_stations):
+    _, path, scans = two_stations
+    stood = [scan["translation"] for scan in scans]
+    whole = read(path)
+    assert np.abs(whole.viewpoints + whole.frame.origin - stood).max() < 1e-9
+    for cloud, place in zip(read_stations(path), stood, strict=True):
+        assert np.abs(cloud.viewpoints + cloud.frame.origin - place).max() < 1e-9
+    (_, second) = whole.viewpoints + whole.frame.origin
+    np.testing.assert_allclose(second, [500_001.0, 4_000_000.0, 21.5])
 
 
 def test_describe_counts_stations(two_stations):
@@ -338,3 +382,15 @@ def test_coordinates_are_metres_even_where_the_system_is_in_feet(tmp_path, crs):
     again = read(tmp_path / "a.laz")
     assert again.frame.unit_m == (1.0, 1.0, 1.0)
     np.testing.assert_allclose(again.frame.to_file(again.xyz), points, atol=1e-4)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:2277", "EPSG:2277+6360"])
+@pytest.mark.parametrize("named", ["", "EPSG:2277"])
+def test_coordinates_are_metres_even_where_a_system_in_feet_is_given(tmp_path, crs, named):
+    points = np.random.default_rng(3).uniform(0, 50, (40, 3)) + [950_000, 3_050_000, 150]
+    plain = read(write_e57(tmp_path / "a.e57", [{"fields": cartesian(points)}], named and crs))
+    cloud = in_system(plain, crs)
+    np.testing.assert_array_equal(cloud.xyz, plain.xyz)
+    assert cloud.frame.unit_m == (1.0, 1.0, 1.0)
+    assert units_of(cloud.frame.crs).unit_m == (1.0, 1.0, 1.0)
+    assert any("metres by definition: taken as metres" in note for note in cloud.notes)

@@ -9,9 +9,9 @@ import pytest
 from laspy.vlrs.vlr import VLR
 from numpy.lib.recfunctions import repack_fields
 
-from dougong.cloud import Frame
+from dougong.cloud import Cloud, Frame
 from dougong.errors import FormatError
-from dougong.formats import check, describe, iterate, read, write
+from dougong.formats import check, describe, iterate, read, write, write_merged
 from dougong.formats.las_header import LasHeader
 from dougong.formats.units import as_wkt, units_of
 
@@ -254,18 +254,56 @@ def test_a_moved_old_file_names_its_new_system_as_laspy_reads_it(tmp_path, crs):
             assert reader.header.global_encoding.wkt == (point_format >= 6)
 
 
-def test_user_defined_projection_in_feet_is_not_taken_for_degrees(tmp_path):
-    """Its keys name a geographic base (4269); only the linear unit is to be used."""
-    path = tmp_path / "a.las"
+def _own_system(path, *units):
+    """Write a file in a user-defined projection on a geographic base (4269), with its unit keys."""
     header = laspy.LasHeader(point_format=1, version="1.2")
     header.scales = [0.01] * 3
-    keys = [(1024, 0, 1, 1), (2048, 0, 1, 4269), (3072, 0, 1, 32767), (3076, 0, 1, 9002)]
+    keys = [(1024, 0, 1, 1), (2048, 0, 1, 4269), (3072, 0, 1, 32767)]
+    keys += [(key, 0, 1, unit) for key, unit in units]
     data = struct.pack("<4H", 1, 1, 0, len(keys)) + b"".join(struct.pack("<4H", *k) for k in keys)
     header.vlrs.append(VLR("LASF_Projection", 34735, "", data))
     las = laspy.LasData(header)
-    las.X = [0, 100]
+    las.X, las.Z = [0, 10_000], [0, 5000]
     las.write(path)
-    cloud = read(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".las", ".copc.laz"])
+@pytest.mark.parametrize("heights", [9001, 9002, 9003])
+def test_units_without_a_named_system_stay_with_the_numbers(tmp_path, suffix, heights):
+    feet = read(_own_system(tmp_path / "a.las", (3076, 9002), (4099, heights)))
+    metres = Cloud.from_points([[0.0, 0, 0], [20, 0, 5]])
+    to_metres = np.diag([0.3048, 0.3048, 0.3048, 1.0])
+    out = tmp_path / f"b{suffix}"
+    moves = [(feet, to_metres, metres), (metres, np.linalg.inv(to_metres), feet)]
+    for source, matrix, target in moves:
+        moved = source.moved(matrix, target.frame)
+        write(moved, out, overwrite=True)
+        assert read(out).frame.unit_m == pytest.approx(target.frame.unit_m, rel=1e-12)
+        assert np.ptp(read(out).xyz, axis=0) == pytest.approx(np.ptp(moved.xyz, axis=0), abs=1e-3)
+        write_merged([target, moved], out, source_ids=[1, 2], overwrite=True)
+        assert read(out).frame.unit_m == pytest.approx(target.frame.unit_m, rel=1e-12)
+    write(feet, out, overwrite=True)
+    assert read(out).frame.unit_m == feet.frame.unit_m
+    found = Cloud.from_points([[0.0, 0, 0], [20, 0, 5]])
+    found = replace(found, frame=replace(found.frame, unit_m=(0.0123,) * 3))
+    write(found, out, overwrite=True)
+    assert read(out).frame.unit_m == found.frame.unit_m
+
+
+def test_heights_in_another_unit_than_their_system_stay(tmp_path):
+    wkt = as_wkt("EPSG:32650")
+    frame = Frame(crs=wkt, unit_m=(1.0, 1.0, 0.3048))
+    cloud = Cloud.from_points([[5e5, 4e6, 0], [5e5 + 20, 4e6, 5]])
+    for suffix in (".las", ".copc.laz"):
+        out = tmp_path / f"a{suffix}"
+        write(cloud.moved(np.eye(4), frame), out)
+        assert (read(out).frame.crs, read(out).frame.unit_m) == (wkt, frame.unit_m)
+
+
+def test_user_defined_projection_in_feet_is_not_taken_for_degrees(tmp_path):
+    """Its keys name a geographic base (4269); only the linear unit is to be used."""
+    cloud = read(_own_system(tmp_path / "a.las", (3076, 9002)))
     assert cloud.frame.crs is None
     assert cloud.frame.unit_m == (0.3048,) * 3
     assert any("could not be understood" in note for note in cloud.notes)

@@ -1,5 +1,7 @@
 """A cloud that comes in pieces is written as the whole is."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -47,6 +49,34 @@ def test_pieces_are_written_as_the_whole(cloud, tmp_path, suffix):
     assert (tmp_path / parts.path).read_bytes() == (tmp_path / whole.path).read_bytes()
     assert parts.notes == whole.notes
     assert parts.points == whole.points == len(cloud)
+
+
+@pytest.mark.parametrize(("last", "kept"), [(512, "u1"), (257, "u2"), (255, "u2")])
+def test_colours_are_those_of_the_whole_whatever_a_piece_shows(tmp_path, last, kept):
+    random_las(tmp_path / "a.las", 2, "1.2", count=2000)
+    cloud = read(tmp_path / "a.las")
+    for name in ("red", "green", "blue"):
+        colour = np.zeros(2000, "u2")
+        colour[700:], colour[1999] = 256, last
+        cloud = cloud.with_attribute(name, colour)
+    whole = write(cloud, tmp_path / "whole.ply")
+    parts = write(pieces_of(cloud, 700), tmp_path / "parts.ply")
+    assert (tmp_path / "parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    assert parts.notes == whole.notes
+    assert read(tmp_path / "parts.ply").attribute("red").dtype == kept
+
+
+def test_ply_of_any_size_holds_a_piece_at_a_time(tmp_path):
+    piece = Cloud.from_points(np.random.default_rng(0).uniform(0, 9, (50_000, 3)))
+
+    def pieces():
+        yield from (piece for _ in range(40))
+
+    tracemalloc.start()
+    assert write(pieces, tmp_path / "a.ply").points == 2_000_000
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10_000_000
 
 
 def test_pieces_are_merged_as_the_whole(cloud, tmp_path):

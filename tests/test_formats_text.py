@@ -370,3 +370,18 @@ def test_bytes_that_are_not_utf8_make_no_noise(tmp_path, capfd):
     assert len(cloud) == 200
     assert "1 of 201 rows" in cloud.notes[0]
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("count", [60, 6000])
+@pytest.mark.parametrize(
+    ("cut", "is_said"),
+    [(0, False), (1, False), (2, True), (4, True), (6, True), (11, False)],  # 11: another row
+)
+def test_a_file_that_ends_within_its_last_number_is_said(tmp_path, count, cut, is_said):
+    points = np.random.default_rng(0).uniform(10, 99, (count, 3))
+    text = "".join(f"{x:.4f} {y:.4f} {z:.4f}\n" for x, y, z in points)
+    cloud = read(save(tmp_path, text[: len(text) - cut]))
+    assert any("may be cut within its last number" in note for note in cloud.notes) == is_said
+    uneven = "".join(f"{x:.4f} {y:.4f} {round(z, 4)}\n" for x, y, z in points)
+    notes = read(save(tmp_path, uneven[:-3], "b.xyz")).notes
+    assert not any("may be cut" in note for note in notes)

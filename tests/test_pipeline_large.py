@@ -300,6 +300,16 @@ def test_a_file_replaced_while_it_is_filtered_ends_the_filter(
     assert {path.name for path in folder.iterdir()} == {"scan.laz", "map.laz"}
 
 
+def test_a_file_replaced_while_it_is_read_once_more_ends_the_run(folder, monkeypatch, capsys):
+    work = ("--work", str(folder / "work"))
+    run(folder, "out", ROOMS["many"], *work, kinds=("lidar",))
+    replaced_at(monkeypatch, "dougong.pipeline.loading.identified", folder / "scan.laz")
+    tokens = tokens_of(folder, "again", ROOMS["many"], *work, kinds=("lidar",))
+    assert call(tokens) == 1
+    assert "scan.laz was changed or replaced while it was worked on" in capsys.readouterr().err
+    assert not (folder / "again").exists()
+
+
 def test_a_file_replaced_while_it_is_registered_ends_the_registration(folder, monkeypatch, capsys):
     replaced_at(monkeypatch, "dougong.pipeline.registering_files.read", folder / "scan.laz")
     tokens = ["register", str(folder / "scan.laz"), str(folder / "map.laz")]

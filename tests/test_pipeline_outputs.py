@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from dougong.errors import InputError, OutputError
+from dougong.formats import unfinished
 from dougong.formats.atomic import replacing
 from dougong.pipeline import outputs
 from dougong.pipeline.result_folder import (
@@ -56,9 +57,9 @@ def test_cancelling_removes_what_was_begun_and_keeps_what_was_there(tmp_path):
     job = result_folder(tmp_path / "result")
     part = job.__enter__()
     (part / "half").write_text("x")
-    with outputs.watched(finished):
-        outputs.part_of(finished).write_text("half")
-        outputs.remove_unfinished()
+    with unfinished.watched(finished):
+        unfinished.part_of(finished).write_text("half")
+        unfinished.remove_unfinished()
     assert [path.name for path in tmp_path.iterdir()] == ["a.laz"]
     assert finished.read_text() == "old"
 
@@ -161,13 +162,34 @@ def test_a_folder_of_use_meanwhile_goes_and_that_of_a_killed_job_too(tmp_path, d
     head = tmp_path / "tiles-o-"
     for mark in (f"{platform.node()}-{dead}", f"{platform.node()}-{os.getpid()}", "elsewhere-1"):
         (tmp_path / f"tiles-o-{mark}" / "deep").mkdir(parents=True)
-    with outputs.passing_folder(head) as folder:
+    with unfinished.passing_folder(head) as folder:
         assert not folder.exists(), "our number, of an earlier life"
         (folder / "deep").mkdir(parents=True)
-        outputs.remove_unfinished()
+        unfinished.remove_unfinished()
         assert not folder.exists(), "cancelled"
         folder.mkdir()
     assert [path.name for path in tmp_path.iterdir()] == ["tiles-o-elsewhere-1"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are not asked for elsewhere")
+def test_a_folder_of_work_has_one_user_at_a_time(tmp_path, dead):
+    folder, here = tmp_path / "work" / "tiles-1", platform.node()
+    mark = tmp_path / "work" / f"tiles-1.user-{here}-{os.getppid()}"
+    with unfinished.sole_user(folder):
+        (own,) = (tmp_path / "work").iterdir()
+        with pytest.raises(OutputError, match="tiles-1 is being worked in by another"):
+            unfinished.sole_user(folder).__enter__()  # a thread of this process, say
+        assert own.exists()
+    own.touch()  # our number, of an earlier life
+    (tmp_path / "work" / f"tiles-1.user-{here}-{dead}").touch()
+    with unfinished.sole_user(folder):
+        assert list((tmp_path / "work").iterdir()) == [own]
+        unfinished.remove_unfinished()
+        assert not own.exists(), "cancelled"
+    mark.touch()
+    with pytest.raises(OutputError, match=rf"process {os.getppid()} on .* pass another --work;"):
+        unfinished.sole_user(folder).__enter__()
+    assert list((tmp_path / "work").iterdir()) == [mark]
 
 
 def test_a_result_folder_that_is_a_file_is_refused_at_once(tmp_path):

@@ -212,6 +212,38 @@ def test_an_unsure_pose_is_not_merged_and_exits_3(folder, status, capsys, monkey
     assert (document["matrix"] is None) == (status == "failed")
 
 
+@pytest.mark.parametrize("status", ["ambiguous", "ok"])
+def test_what_a_file_could_not_hold_is_said_of_merged_clouds_and_others(
+    folder, status, capsys, monkeypatch
+):
+    monkeypatch.setattr("dougong.pipeline.links.register", answer(status))
+    shiny = cloud(0).with_attribute("intensity", np.linspace(0, 1, 6000))
+    dougong.write(shiny, folder / "one.ply")
+    tokens = ("--lidar", folder / "one.ply", "--photogrammetry", folder / "map.laz")
+    _, result = run(capsys, *tokens, "--out", folder / "out")
+    said = [note for note in result["notes"] if "intensity is fractional" in note]
+    start = "merged.copc.laz: one: " if status == "ok" else "clouds/one.laz: "
+    assert [note.startswith(start) for note in said] == [True]
+
+
+def test_a_filter_kept_from_an_earlier_run_speaks_of_the_file_as_it_is_called_now(folder, capsys):
+    notes = []
+    sparse = cloud(0).select(np.arange(0, 6000, 10))  # loses much, which is said
+    dougong.write(sparse, folder / "one.laz", overwrite=True)
+    tokens = ("--out", folder / "out", "--work", folder / "work", "--overwrite")
+    for name in ("one", "renamed"):
+        if name == "renamed":
+            (folder / "one.laz").rename(folder / "renamed.laz")
+        project = folder / "project.toml"
+        project.write_text(
+            f'[[cloud]]\nname="scan"\nkind="lidar"\nfiles=["{name}.laz"]\n'
+            '[filter.lidar.curvature_weighted]\nrule="paper"\n'
+        )
+        notes.append(run(capsys, project, *tokens)[1]["notes"])
+    assert any(note.startswith("one, curvature_weighted: took ") for note in notes[0])
+    assert notes[1] == [note.replace("one", "renamed", 1) for note in notes[0]]
+
+
 def test_the_best_pose_is_taken_when_the_project_says_so(folder, capsys, monkeypatch):
     monkeypatch.setattr("dougong.pipeline.links.register", answer("ambiguous"))
     project = clouds(folder, more="[register]\naccept_best = true\n")

@@ -235,7 +235,7 @@ def test_a_place_is_made_again_by_its_seed(kind):
         # Posts of the scaffolding stand about and are found: they moved with it.
         ("scaffold", 2, 0, "alone tells which way round"),
         ("scaffold", 40, 0, "alone tells which way round"),
-        ("stalls", 2, 2, "found under another one"),
+        ("stalls", 2, 2, "this plan repeats every 180 degrees"),
     ],
 )
 def test_a_copy_that_fits_best_is_not_ok(kind, seed, things, said):

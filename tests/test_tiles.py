@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from dougong.filters.octree_voxel_grid import (
     robust_box,
 )
 from dougong.formats import faults_of, read
+from dougong.pipeline import memory
 from dougong.threads import set_threads
 from dougong.tiles.cloud import read_arrays
 from dougong.tiles.engine import set_engine
@@ -27,6 +29,7 @@ from dougong.tiles.grid import TileGrid, grid_for, leaves_of, part
 from dougong.tiles.partition import partition
 from dougong.tiles.spool import Spool
 from dougong.tiles.store import RowFile, Rows
+from e57_surveys import survey
 from tile_scans import KILLED, VOXEL, filtered_by, make_little_room, site, write_scan
 
 
@@ -216,6 +219,32 @@ def test_filter_is_the_same_on_tiles(scan, tmp_path, little_room, what):
     assert not list(tmp_path.glob("tiles-*"))
 
 
+def test_filter_of_a_survey_is_the_same_on_tiles(tmp_path, little_room):
+    survey(tmp_path / "scans.e57", scans=2, rows=150, columns=150, kind="double")
+    file, only = tmp_path / "scans.e57", ("--only", "pass_through")
+    only += ("--set", "pass_through.z_m=[0, 40]")
+    whole, said = filtered_by(file, tmp_path / "a.e57", *only, "--memory", "4GB")
+    tiled, told = filtered_by(file, tmp_path / "b.e57", *only, "--memory", "190kB")
+    assert [scan.station for scan in tiled.header.stations] == [0, 1]
+    np.testing.assert_array_equal(tiled.xyz, whole.xyz)
+    np.testing.assert_array_equal(tiled.records, whole.records)
+    np.testing.assert_array_equal(tiled.viewpoints, whole.viewpoints)
+    assert told["notes"] == said["notes"]
+    assert told["reasons"] == said["reasons"]
+
+
+@pytest.mark.parametrize("mark", [(), ("--mark",)])
+def test_a_survey_that_is_too_large_to_be_written_is_refused(tmp_path, little_room, capsys, mark):
+    file = survey(tmp_path / "scans.e57", scans=2, rows=150, columns=150, kind="double")
+    tokens = ["filter", str(file), str(tmp_path / "a.e57"), "--only", "pass_through", *mark]
+    tokens += ["--memory", "190kB", "--quiet"]
+    assert call(tokens) == 2
+    said = capsys.readouterr().err
+    assert "a.e57 is held as a whole while it is written" in said
+    assert "more than --memory 0.0 GB" in said
+    assert list(tmp_path.iterdir()) == [file]
+
+
 def test_run_is_the_same_on_tiles_and_goes_on_where_it_was(
     scan, tmp_path, little_room, capsys, monkeypatch
 ):
@@ -232,6 +261,69 @@ def test_run_is_the_same_on_tiles_and_goes_on_where_it_was(
     assert len({result["result_hash"] for result in results}) == 1
     assert results[0]["notes"] == results[1]["notes"] == results[2]["notes"]
     assert results[1]["inputs"] == results[0]["inputs"]
+
+
+def test_tiles_of_another_unit_are_not_gone_on_with(tmp_path, little_room, monkeypatch):
+    monkeypatch.setattr("dougong.app._build_report", lambda *_: None)
+    write_scan(tmp_path / "scan.laz", 17_000)
+
+    def stages(crs, work):
+        told = f'[[cloud]]\nname = "scan"\nkind = "lidar"\nfiles = ["scan.laz"]\ncrs = "{crs}"\n'
+        (tmp_path / "p.toml").write_text(told)
+        tokens = ["run", str(tmp_path / "p.toml"), "--out", str(tmp_path / "out"), "--overwrite"]
+        tokens += ["--work", str(tmp_path / work), "--memory", "110kB", "--quiet"]
+        assert call(tokens) == 0
+        (cloud,) = json.loads((tmp_path / "out" / "result.json").read_text())["clouds"]
+        return [(stage["name"], stage["points_out"]) for stage in cloud["stages"]]
+
+    metres, feet = stages("EPSG:32650", "work"), stages("EPSG:2227", "work")
+    assert metres != feet
+    assert feet == stages("EPSG:2227", "other")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are not asked for elsewhere")
+@pytest.mark.parametrize("command", ["filter", "run"])
+def test_two_processes_do_not_cut_the_same_tiles(
+    scan, tmp_path, little_room, monkeypatch, capsys, command
+):
+    tokens = ["--work", str(tmp_path / "work"), "--memory", "190kB", "--quiet", "--overwrite"]
+    if command == "run":
+        monkeypatch.setattr("dougong.app._build_report", lambda *_: None)
+        tokens = ["run", "--lidar", str(scan), "--out", str(tmp_path / "out"), *tokens]
+    else:
+        tokens = ["filter", str(scan), str(tmp_path / "out.laz"), "--kind", "lidar", *tokens]
+    assert call(tokens) == 0
+    (tiles,) = (tmp_path / "work").glob("tiles-*")
+    before = sorted(tiles.iterdir())
+    for books in (tmp_path / "work").glob("*.books.*"):
+        books.unlink()
+    other = tiles.with_name(f"{tiles.name}.user-{platform.node()}-{os.getppid()}")
+    other.touch()
+    assert call(tokens) == 1
+    assert f"{tiles} is being worked in by another dougong" in capsys.readouterr().err
+    assert sorted(tiles.iterdir()) == before
+    other.unlink()
+    assert call(tokens) == 0
+
+
+def test_tiles_are_gone_on_with_whatever_is_free_at_the_moment(
+    scan, tmp_path, little_room, monkeypatch
+):
+    cut = []
+    known = Spool.__init__
+    monkeypatch.setattr(Spool, "__init__", lambda *args: (cut.append(1), known(*args))[1])
+    work = tmp_path / "work"
+
+    def run(*options):
+        filtered_by(scan, tmp_path / "out.laz", "--kind", "lidar", "--overwrite", *options,
+                    "--work", str(work))  # fmt: skip
+        return len(cut), len(list(work.glob("tiles-*")))
+
+    for free in (200_000, 185_000, 210_000):
+        monkeypatch.setattr(memory, "_free_bytes", lambda free=free: free)
+        assert run() == (1, 1)
+    assert run("--memory", "140kB") == (2, 1), "larger tiles than there is room for now"
+    assert run("--memory", "190kB") == (2, 1)
 
 
 @pytest.mark.filterwarnings("ignore")  # of the cluster's own

@@ -2,6 +2,8 @@
 
 import importlib
 import json
+import os
+import platform
 import subprocess
 import sys
 
@@ -10,6 +12,7 @@ import pytest
 
 from dougong.cli import call
 from dougong.errors import InputError, OutputError
+from dougong.formats.unfinished import passing_folder, remove_unfinished
 from dougong.tiles import engine as engines
 from dougong.tiles.cloud import read_file, read_record, write_arrays
 from dougong.tiles.folder import LocalFolder
@@ -26,6 +29,36 @@ def scan(tmp_path):
 @pytest.fixture
 def little_room(monkeypatch):
     make_little_room(monkeypatch)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are not asked for elsewhere")
+def test_the_next_process_clears_what_a_killed_one_had_begun(tmp_path):
+    killed = (
+        "import os, sys; from pathlib import Path; from dougong.tiles.folder import LocalFolder\n"
+        "LocalFolder(Path(sys.argv[1])).write('0_0.points.npz', lambda _: os._exit(9))"
+    )
+    subprocess.run([sys.executable, "-c", killed, str(tmp_path)], check=False)
+    (left,) = tmp_path.iterdir()
+    theirs = tmp_path / f"0_1.points.npz.part-{platform.node()}-{os.getppid()}"
+    theirs.touch()
+    folder = LocalFolder(tmp_path)
+    for name in ("1_1.points.npz", "0_0.points.npz"):
+        folder.write(name, lambda file: file.write(b"whole"))
+        assert not left.exists()
+    assert folder.names() == {"0_0.points.npz", "1_1.points.npz", theirs.name}
+
+
+def test_a_cancelled_job_does_not_make_its_folder_again(tmp_path):
+    """Its threads go on for a moment, and left tiles beside the output now and then."""
+    with passing_folder(tmp_path / "tiles-o-") as beside:
+        folder = LocalFolder(beside / "tiles")
+        folder.write("0_0.points.npz", lambda file: file.write(b"whole"))
+        remove_unfinished()
+        with pytest.raises(OutputError, match="the job was cancelled"):
+            folder.write("0_1.points.npz", lambda file: file.write(b"whole"))
+        assert not beside.exists()
+    with passing_folder(tmp_path / "tiles-o-"):
+        folder.write("0_1.points.npz", lambda file: file.write(b"whole"))
 
 
 @pytest.mark.parametrize("kind", ["disk", "memory", "s3"])

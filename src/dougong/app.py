@@ -56,7 +56,7 @@ def register_clouds(
 
 def remove_unfinished() -> None:
     """Remove what a cancelled job had begun to write."""
-    from dougong.pipeline.outputs import remove_unfinished as remove
+    from dougong.formats.unfinished import remove_unfinished as remove
 
     remove()
 

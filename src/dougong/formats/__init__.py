@@ -13,7 +13,6 @@ from dougong.formats.model import FileInfo, Finding, PlacedStation, Written
 from dougong.formats.registry import (
     SUFFIXES,
     WRITABLE,
-    has_metric_format,
     iterate,
     read,
     read_stations,
@@ -22,7 +21,14 @@ from dougong.formats.registry import (
 )
 from dougong.formats.reissue import can_reissue, reissue, scans_in, system_in
 from dougong.formats.unfinished import part_of
-from dougong.formats.units import in_system, is_same_crs, metric_problem, require_metric, units_of
+from dougong.formats.units import (
+    has_metric_format,
+    in_system,
+    is_same_crs,
+    metric_problem,
+    require_metric,
+    units_of,
+)
 
 __all__ = [
     "SUFFIXES",

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from dougong.errors import OutputError
-from dougong.formats.unfinished import clear_parts, part_of
+from dougong.formats.unfinished import clear_parts, part_of, removed_if_cancelled
 
 _COPY_BYTES = 8 << 20
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -124,21 +124,22 @@ def replacing(path: Path, *, expected_bytes: int) -> Iterator[Sink]:
     except OSError as error:
         raise _explain(error, path, expected_bytes) from error
     sink = Sink(file)
-    try:
-        yield sink
-        sink.flush()
-        os.fsync(file.fileno())
-        file.close()
-        part.replace(path)
-    except BaseException as error:
-        # Closing flushes, which fails again on a full disk; the first error is the one to tell.
-        with contextlib.suppress(OSError):
+    with removed_if_cancelled(part):
+        try:
+            yield sink
+            sink.flush()
+            os.fsync(file.fileno())
             file.close()
-        part.unlink(missing_ok=True)
-        cause = sink.error or (error if isinstance(error, OSError) else None)
-        if cause is not None:
-            raise _explain(cause, path, expected_bytes) from error
-        raise
+            part.replace(path)
+        except BaseException as error:
+            # Closing flushes, which fails again on a full disk; the first error is the one to tell.
+            with contextlib.suppress(OSError):
+                file.close()
+            part.unlink(missing_ok=True)
+            cause = sink.error or (error if isinstance(error, OSError) else None)
+            if cause is not None:
+                raise _explain(cause, path, expected_bytes) from error
+            raise
     _sync_folder(path.parent)
 
 

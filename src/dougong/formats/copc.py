@@ -8,7 +8,6 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import IO, Any
 
 import numpy as np
@@ -57,7 +56,8 @@ class CopcWriter:
     header : LasHeader
         LAS 1.4, point format 6, 7 or 8.
     scratch : Path
-        Gets a temporary folder where there are more than `most_points`: twice the records.
+        A folder of its own; made where there are more than `most_points`, and gets twice the
+        records. Whoever named it removes it.
     most_points : int
         Points that are held at once, at least `LEAF_CAPACITY`.
     """
@@ -72,7 +72,6 @@ class CopcWriter:
         self._totals = Totals()
         self._times = [np.inf, -np.inf]
         self._held: list[Records] = []
-        self._folder: TemporaryDirectory[str] | None = None
         self._file: RecordFile | None = None
 
     def append(self, records: Records) -> None:
@@ -85,8 +84,8 @@ class CopcWriter:
             self._times[0] = min(self._times[0], float(times.min()))
             self._times[1] = max(self._times[1], float(times.max()))
         if self._file is None and self._totals.count > self._most:
-            self._folder = TemporaryDirectory(prefix="copc-", dir=self._scratch)
-            self._file = RecordFile(Path(self._folder.name) / "points", records.dtype)
+            self._scratch.mkdir()
+            self._file = RecordFile(self._scratch / "points", records.dtype)
             for piece in self._held:
                 self._file.append(piece)
             self._held.clear()
@@ -120,16 +119,12 @@ class CopcWriter:
         self, header: LasHeader, cube: Cube, laszip: Any, start: int
     ) -> list[_Chunk]:
         """Compress part by part into a file of its own, then copy the nodes in their order."""
-        assert self._folder is not None
         assert self._file is not None
-        folder = Path(self._folder.name)
-        with self._folder:
-            packed = folder / "packed"
-            with packed.open("w+b") as file:
-                nodes = _nodes_in_parts(self._file, header, cube, self._most, folder)
-                chunks = _compressed(Sink(file), laszip, 0, nodes)
-                chunks.sort(key=lambda chunk: (chunk.level, chunk.key))
-                return _copied(file, self._sink, laszip, start, chunks)
+        with (self._scratch / "packed").open("w+b") as file:
+            nodes = _nodes_in_parts(self._file, header, cube, self._most, self._scratch)
+            chunks = _compressed(Sink(file), laszip, 0, nodes)
+            chunks.sort(key=lambda chunk: (chunk.level, chunk.key))
+            return _copied(file, self._sink, laszip, start, chunks)
 
     def _finish(self, header: LasHeader, cube: Cube, chunks: list[_Chunk], first: int) -> None:
         sink = self._sink

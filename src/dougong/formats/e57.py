@@ -43,6 +43,11 @@ class E57Header:
     stations: tuple[E57Header, ...] = ()
     """Of several scans read as one cloud: the header of each."""
 
+    @property
+    def translation(self) -> NDArray[np.float64]:
+        """(3,) metres, where the scanner stood if the file says so."""
+        return self.pose.translation
+
 
 @dataclass
 class E57Scan:

@@ -12,7 +12,7 @@ from dougong.errors import FormatError
 from dougong.formats.geotiff import read_geokeys
 from dougong.formats.las_header import PROJECTION, LasHeader, bits_of, read_header
 from dougong.formats.laz import Undecodable, damaged, decode, open_decoder, readable_points
-from dougong.formats.model import FileInfo, as_triple
+from dougong.formats.model import FileInfo, Triple, as_triple
 from dougong.formats.stream import opened, refuse_empty, stem_of, unit_notes
 from dougong.formats.units import as_wkt, units_of
 
@@ -42,20 +42,26 @@ def frame_of(header: LasHeader) -> Frame:
     an integer coordinate (NaN, outside int32) puts the origin at the file's offset.
     """
     crs = crs_of(header)
-    units = units_of(crs)
-    unit = np.array(units.unit_m)
-    keys = read_geokeys(header.vlrs)
-    if keys is not None and crs is None and keys.horizontal_m is not None:
-        unit[:] = keys.horizontal_m
-    if keys is not None and not units.has_vertical and keys.vertical_m is not None:
-        unit[2] = keys.vertical_m
-    origin = (header.offset + lattice_origin(header) * header.scale) * unit
+    unit_m = unit_of(header, crs)
+    origin = (header.offset + lattice_origin(header) * header.scale) * np.asarray(unit_m)
     return Frame(
         origin=origin,
         crs=crs,
-        unit_m=(float(unit[0]), float(unit[1]), float(unit[2])),
+        unit_m=unit_m,
         step=(float(header.scale[0]), float(header.scale[1]), float(header.scale[2])),
     )
+
+
+def unit_of(header: LasHeader, crs: str | None) -> Triple:
+    """Return metres per unit of x, y, z of a header whose reference system is `crs`."""
+    units = units_of(crs)
+    x, y, z = units.unit_m
+    keys = read_geokeys(header.vlrs)
+    if keys is not None and crs is None and keys.horizontal_m is not None:
+        x = y = z = keys.horizontal_m
+    if keys is not None and not units.has_vertical and keys.vertical_m is not None:
+        z = keys.vertical_m
+    return x, y, z
 
 
 def lattice_origin(header: LasHeader) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

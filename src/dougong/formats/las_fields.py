@@ -176,15 +176,38 @@ def _place_intensity(records: Records, values: NDArray[Any], facts: Facts, notes
     return ""
 
 
-def shrunk_colours(columns: dict[str, NDArray[Any]], notes: list[str]) -> dict[str, NDArray[Any]]:
-    """Return columns whose 16-bit colours are the 8-bit ones viewers expect, if no bit is lost."""
+EIGHT_BIT = (257, 256, 1)
+"""What 16-bit colours may be multiples of that are 8-bit ones; the first that fits counts."""
+
+
+def _wide_colours(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     colours = {n: columns[n] for n in ("red", "green", "blue") if n in columns}
-    if not colours or any(values.dtype.itemsize != 2 for values in colours.values()):
+    return colours if all(values.dtype.itemsize == 2 for values in colours.values()) else {}
+
+
+def eight_bit_factors(columns: Mapping[str, NDArray[Any]]) -> set[int]:
+    """Return those of `EIGHT_BIT` by which no bit of 16-bit colours is lost."""
+    colours = _wide_colours(columns).values()
+    return {
+        factor
+        for factor in EIGHT_BIT
+        if all(not (v % factor).any() and not (v > 255 * factor).any() for v in colours)
+    }
+
+
+def shrunk_colours(
+    columns: dict[str, NDArray[Any]], notes: list[str], factors: set[int] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Return columns whose 16-bit colours are the 8-bit ones viewers expect, if no bit is lost.
+
+    `factors` are those of `eight_bit_factors` of a whole cloud, where this is a piece of it.
+    """
+    colours = _wide_colours(columns)
+    if not colours:
         return columns
-    for factor in (257, 256):
-        if all(not (values % factor).any() for values in colours.values()):
-            return columns | {n: (v // factor).astype(np.uint8) for n, v in colours.items()}
-    if all((values <= 255).all() for values in colours.values()):
-        return columns | {name: values.astype(np.uint8) for name, values in colours.items()}
+    factors = eight_bit_factors(columns) if factors is None else factors
+    factor = next((factor for factor in EIGHT_BIT if factor in factors), None)
+    if factor is not None:
+        return columns | {n: (v // factor).astype(np.uint8) for n, v in colours.items()}
     notes.append("colours stay 16-bit, as they use more than 8; some viewers expect 8.")
     return columns

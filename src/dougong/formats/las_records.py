@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from dougong.cloud import Cloud, Records
 from dougong.errors import OutputError
-from dougong.formats.geotiff import geokeys_of
-from dougong.formats.las import crs_of, has_mixed_channels
+from dougong.formats.las import frame_of, has_mixed_channels
 from dougong.formats.las_fields import Facts, canonical, coordinate_fields, fill_standard
 from dougong.formats.las_header import (
     EXTRA_BYTES,
@@ -31,7 +30,8 @@ from dougong.formats.las_header import (
     Vlr,
     new_header,
 )
-from dougong.formats.units import is_same_crs, las_wkt, units_of
+from dougong.formats.las_system import with_system
+from dougong.formats.units import units_of
 from dougong.typing import Points
 
 FINEST_M = 1e-4
@@ -82,7 +82,7 @@ def las_parts(
         header, records = _with_extras(header, records, notes)
     else:
         header, records = _built(cloud, notes, whole)
-    header = with_crs(header, cloud.frame.crs, notes)
+    header = with_system(header, cloud.frame, notes, is_moved=cloud.is_moved)
     return header, records, notes
 
 
@@ -301,29 +301,6 @@ def describe_extras(
     return replace(header, vlrs=(*others, record)).patched("H", 105, size)
 
 
-def with_crs(header: LasHeader, crs: str | None, notes: list[str]) -> LasHeader:
-    """Return the header with this reference system; untouched where it has it already."""
-    if is_same_crs(crs_of(header), crs):
-        return header
-    vlrs = tuple(vlr for vlr in header.vlrs if vlr.key[0] != PROJECTION)
-    evlrs = tuple(vlr for vlr in header.evlrs if vlr.key[0] != PROJECTION)
-    header = replace(header, vlrs=vlrs, evlrs=evlrs)
-    if crs is None:
-        return header
-    keys = geokeys_of(crs) if header.point_format < 6 else None
-    if keys is not None:
-        encoding = struct.unpack_from("<H", header.raw, 6)[0]
-        return replace(header, vlrs=(*header.vlrs, keys)).patched("H", 6, encoding & ~0b10000)
-    data = las_wkt(crs).encode() + b"\0"
-    record = Vlr(PROJECTION, 2112, data)
-    if len(data) > 65535:
-        notes.append("the reference system is longer than a LAS record and was left out.")
-        return header
-    header = replace(header, vlrs=(*header.vlrs, record))
-    encoding = struct.unpack_from("<H", header.raw, 6)[0]
-    return header.patched("H", 6, encoding | 0b10000) if header.minor >= 4 else header
-
-
 def upgraded(
     header: LasHeader, records: Records, notes: list[str], point_format: int | None = None
 ) -> tuple[LasHeader, Records]:
@@ -331,7 +308,7 @@ def upgraded(
     names = set(records.dtype.names or ())
     if point_format is None:
         point_format = 8 if "nir" in names else 7 if "red" in names else 6
-    crs = crs_of(header)
+    frame = frame_of(header)
     raw = bytearray(header.raw[:227].ljust(375, b"\0"))
     struct.pack_into("<BB", raw, 24, 1, 4)
     struct.pack_into("<HI", raw, 94, HEADER_BYTES[4], 375)
@@ -366,7 +343,7 @@ def upgraded(
     modern = LasHeader(bytes(raw), vlrs, evlrs, source=header.source)
     encoding = struct.unpack_from("<H", raw, 6)[0]
     modern = modern.patched("H", 6, (encoding & ~0b110) | 0b10000)
-    return with_crs(modern, crs, notes), result
+    return with_system(modern, frame, notes), result
 
 
 def _unpack_legacy(records: Records, result: Records) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong.cloud import Cloud, Pieces, Records, in_pieces
+from dougong.cloud import Cloud, Frame, Pieces, Records, in_pieces
 from dougong.errors import FrameError, InputError, OutputError
 from dougong.formats.atomic import refuse_bad_target
 from dougong.formats.las_header import POINT_FORMATS, LasHeader, Vlr, new_header
@@ -21,8 +21,8 @@ from dougong.formats.las_records import (
     extra_type,
     scaling_for,
     set_integers,
-    with_crs,
 )
+from dougong.formats.las_system import with_system
 from dougong.formats.model import Hold, Written
 from dougong.formats.registry import family_of, write_las_records
 from dougong.formats.units import is_same_crs
@@ -75,7 +75,7 @@ def write_merged(
         refuse_bad_target(path, overwrite=overwrite, source=getattr(first.header, "source", None))
     _refuse_mixed_frames(firsts)
     parts = [
-        _Part(pieces, form, ident, first.frame.crs)
+        _Part(pieces, form, ident, first.frame)
         for pieces, first, ident in zip(sources, firsts, source_ids, strict=True)
         if (form := las_form(pieces, modern=True)).points
     ]
@@ -97,7 +97,7 @@ class _Part(NamedTuple):
     pieces: Pieces
     form: LasForm
     ident: int
-    crs: str | None
+    frame: Frame
     has_time: bool = True
     """False: its GPS times are not those of the file, and become 0."""
 
@@ -153,7 +153,7 @@ def _joined_header(parts: Sequence[_Part], notes: list[str]) -> LasHeader:
     timed = [form for form in forms if form.last_time is not None] or forms[:1]
     is_standard = any(form.header.raw[6] & 1 for form in timed)
     header = describe_extras(_base(first, point_format, is_standard), extras, known)
-    return with_crs(header, parts[0].crs, notes).with_scaling(scale, offset)
+    return with_system(header, parts[0].frame, notes).with_scaling(scale, offset)
 
 
 def _records(parts: Sequence[_Part], header: LasHeader) -> Iterator[Records]:

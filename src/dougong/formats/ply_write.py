@@ -1,12 +1,20 @@
 """Write a cloud as binary PLY: the vertices of a PLY file bit for bit, others converted."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from dougong.cloud import Cloud, Records
+from dougong.cloud import Cloud, Pieces, Records
+from dougong.errors import InputError
 from dougong.formats.atomic import Sink
-from dougong.formats.las_fields import columns_of, coordinate_fields, shrunk_colours
+from dougong.formats.las_fields import (
+    EIGHT_BIT,
+    columns_of,
+    coordinate_fields,
+    eight_bit_factors,
+    shrunk_colours,
+)
 from dougong.formats.las_header import LasHeader
 from dougong.formats.ply import CRS_COMMENT, PlyHeader, has_crs
 from dougong.formats.units import las_wkt
@@ -19,8 +27,32 @@ _ENCODINGS = {"<": "binary_little_endian", ">": "binary_big_endian"}
 _PIECE = 1_000_000
 
 
-def ply_parts(cloud: Cloud) -> tuple[bytes, Records, list[str]]:
-    """Return header, vertices and notes that hold `cloud` as PLY."""
+@dataclass(frozen=True, slots=True)
+class Whole:
+    """What is known of a whole cloud while it is written in pieces, so that all come out alike."""
+
+    points: int
+    factors: set[int]
+    """Of 16-bit colours, see `eight_bit_factors`."""
+
+
+def whole_of(pieces: Pieces) -> tuple[Whole, Cloud]:
+    """Pass over a cloud once; return what is known of it, and a piece with a point if one has."""
+    points, factors = 0, set(EIGHT_BIT)
+    sample: Cloud | None = None
+    for piece in pieces():
+        points += len(piece)
+        if isinstance(piece.header, LasHeader):
+            factors &= eight_bit_factors(columns_of(piece))
+        if sample is None or not len(sample):
+            sample = piece.select(np.arange(min(1, len(piece))))
+    if sample is None:
+        raise InputError("a cloud in pieces needs at least one piece, got none.")
+    return Whole(points, factors), sample
+
+
+def ply_parts(cloud: Cloud, whole: Whole) -> tuple[bytes, Records, list[str]]:
+    """Return the header of the whole, and vertices and notes that hold a piece of it as PLY."""
     notes: list[str] = []
     comments: list[str] = []
     order = "<"
@@ -38,13 +70,13 @@ def ply_parts(cloud: Cloud) -> tuple[bytes, Records, list[str]]:
     if isinstance(cloud.header, PlyHeader) and not cloud.is_moved:
         records = cloud.records
     else:
-        records = _converted(cloud, notes)
+        records = _converted(cloud, notes, whole)
     records = _storable(records, order, notes)
     if not has_crs(cloud.header, cloud.frame.crs):
         comments = [line for line in comments if not line.lower().startswith("comment crs")]
         if cloud.frame.crs is not None:
             comments.append(f"comment {CRS_COMMENT}{_ascii_crs(cloud.frame.crs)}")
-    lines = ["ply", f"format {_ENCODINGS[order]} 1.0", *comments, f"element vertex {len(records)}"]
+    lines = ["ply", f"format {_ENCODINGS[order]} 1.0", *comments, f"element vertex {whole.points}"]
     for name in records.dtype.names or ():
         kind = records.dtype[name]
         lines.append(f"property {_NAMES[kind.str.lstrip('<>|=')]} {name}")
@@ -59,14 +91,14 @@ def _ascii_crs(crs: str) -> str:
     return " ".join(las_wkt(crs).split()).encode("ascii", "replace").decode("ascii")
 
 
-def _converted(cloud: Cloud, notes: list[str]) -> Records:
+def _converted(cloud: Cloud, notes: list[str], whole: Whole) -> Records:
     """Return records with double x, y, z in front and every attribute unpacked behind them."""
     coordinates = cloud.frame.to_file(cloud.xyz)
     dropped = coordinate_fields(cloud)
     layout: list[tuple[str, object]] = [(axis, "<f8") for axis in "xyz"]
     columns = {n: v for n, v in columns_of(cloud).items() if n not in dropped}
     if isinstance(cloud.header, LasHeader):
-        columns = shrunk_colours(columns, notes)
+        columns = shrunk_colours(columns, notes, whole.factors)
     for name, values in columns.items():
         layout.append(
             (name, values.dtype if values.ndim == 1 else (values.dtype, values.shape[1:]))
@@ -134,9 +166,7 @@ def _safe_names(keys: Sequence[str], notes: list[str]) -> list[str]:
     return names
 
 
-def write_ply(sink: Sink, head: bytes, records: Records) -> int:
-    """Write a header and its vertices; return how many there are."""
-    sink.write(head)
+def write_vertices(sink: Sink, records: Records) -> None:
+    """Write vertices behind those that are there."""
     for start in range(0, len(records), _PIECE):
         sink.write(np.ascontiguousarray(records[start : start + _PIECE]).view(np.uint8).data)
-    return len(records)

@@ -7,10 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from dougong.cloud import Cloud, Pieces, in_pieces, joined_pieces
 from dougong.errors import FormatError, FrameError, InputError, OutputError
+from dougong.formats.joined_scans import chunks_as_one, joined_scans
 from dougong.formats.model import Hold, Written
 from dougong.formats.remembered import Remembered
 from dougong.formats.stream import (
@@ -19,6 +18,7 @@ from dougong.formats.stream import (
     iterate_scans,
     opened,
     read_scans,
+    scans_without_points,
     stem_of,
     survey_of,
 )
@@ -65,14 +65,6 @@ def kind_of(path: Path) -> str:
         )
         raise FormatError(msg)
     return kind
-
-
-def has_metric_format(cloud: Cloud) -> bool:
-    """Say whether a cloud was read from a format whose lengths are metres by definition."""
-    from dougong.formats.e57 import E57Header
-    from dougong.formats.ptx import PtxHeader
-
-    return isinstance(cloud.header, E57Header | PtxHeader)
 
 
 def scans_of(path: Path, kind: str) -> list[Scan]:
@@ -161,58 +153,23 @@ def read(path: Path | str) -> Cloud:
     """
     path = Path(path)
     clouds = read_stations(path)
-    if len(clouds) == 1 and getattr(clouds[0].header, "station", 0) == 0:
-        return clouds[0]
-    return _merged_stations(clouds, path)
+    return joined_scans(clouds, path) if _is_survey(clouds) else clouds[0]
 
 
-def _merged_stations(clouds: Sequence[Cloud], path: Path) -> Cloud:
-    marked = [
-        cloud.with_attribute("station", np.full(len(cloud), cloud.header.station, dtype="<u2"))
-        for cloud in clouds
-    ]
-    layout: dict[str, Any] = {}
-    for cloud in marked:
-        for name in cloud.records.dtype.names or ():
-            kind = cloud.records.dtype[name]
-            layout[name] = np.promote_types(layout[name], kind) if name in layout else kind
-    records = np.zeros(sum(map(len, marked)), dtype=list(layout.items()))
-    xyz = np.empty((len(records), 3))
-    at = 0
-    missing: set[str] = set()
-    for cloud in marked:
-        part = slice(at, at + len(cloud))
-        xyz[part] = cloud.xyz
-        for name in layout:
-            if name in (cloud.records.dtype.names or ()):
-                records[name][part] = cloud.records[name]
-            else:
-                missing.add(name)
-        at += len(cloud)
-    notes = [f"{cloud.name}: {note}" for cloud in clouds for note in cloud.notes]
-    notes += [f"{name} is 0 for stations without it." for name in sorted(missing)]
-    headers = tuple(cloud.header for cloud in clouds)
-    places = np.full((1 + max(cloud.header.station for cloud in clouds), 3), np.nan)
-    for cloud in clouds:
-        if cloud.viewpoints is not None:
-            places[cloud.header.station] = cloud.viewpoints[0]
-    return replace(
-        clouds[0],
-        xyz=xyz,
-        records=records,
-        viewpoints=places,
-        name=stem_of(path),
-        header=replace(headers[0], stations=headers),
-        notes=tuple(notes),
-    )
+def _is_survey(scans: Sequence[Cloud | Scan]) -> bool:
+    """Say whether the one cloud of a file's scans tells them apart."""
+    return len(scans) > 1 or any(getattr(scan.header, "station", 0) for scan in scans)
 
 
-def iterate(path: Path | str, chunk_points: int = 1_000_000) -> Iterator[Cloud]:
+def iterate(
+    path: Path | str, chunk_points: int = 1_000_000, *, as_one: bool = False
+) -> Iterator[Cloud]:
     """Yield a file in clouds of at most `chunk_points` points that share one frame.
 
     The file is never held as a whole (PCD binary_compressed is one block by design: it is).
     All but LAS are passed over twice, once where that was done before and is remembered. Scans of
-    an E57 or PTX file follow one another; `cloud.header.station` tells them apart.
+    an E57 or PTX file follow one another; `cloud.header.station` tells them apart. With `as_one`
+    the chunks are those of the one cloud that `read` returns.
 
     Raises
     ------
@@ -227,12 +184,17 @@ def iterate(path: Path | str, chunk_points: int = 1_000_000) -> Iterator[Cloud]:
         from dougong.formats import las
 
         return las.iterate(path, chunk_points)
-    return _surveyed(path, scans_of(path, kind), chunk_points)
+    return _surveyed(path, scans_of(path, kind), chunk_points, as_one=as_one)
 
 
-def _surveyed(path: Path, scans: list[Scan], rows: int) -> Iterator[Cloud]:
+def _surveyed(path: Path, scans: list[Scan], rows: int, *, as_one: bool) -> Iterator[Cloud]:
     # A generator: the pass is made when the first cloud is asked for.
-    yield from iterate_scans(scans, rows, file_survey(path, scans))
+    survey = file_survey(path, scans)
+    chunks = iterate_scans(scans, rows, survey)
+    if len(scans) == 1:
+        chunks = (replace(chunk, name=stem_of(path)) for chunk in chunks)
+    empty = scans_without_points(scans, survey) if as_one and _is_survey(scans) else []
+    yield from chunks_as_one(chunks, empty, path) if _is_survey(empty) else chunks
 
 
 def family_of(path: Path) -> str:
@@ -264,7 +226,7 @@ def write(
     Parameters
     ----------
     cloud : Cloud or Pieces
-        A cloud that comes in pieces is never held as a whole, unless as E57 or PLY.
+        A cloud that comes in pieces is never held as a whole, unless as E57.
     notes : sequence of str, optional
         Put in front of the notes returned.
     hold : Hold, optional
@@ -284,11 +246,16 @@ def write(
     pieces = in_pieces(cloud)
     first = next(iter(pieces()))
     refuse_bad_target(path, overwrite=overwrite, source=getattr(first.header, "source", None))
-    if family in (".e57", ".ply"):
-        return _write_whole(joined_pieces(pieces), path, family, notes or ())
+    if family == ".ply":
+        return _write_ply(pieces, path, notes or ())
+    if family == ".e57":
+        whole = joined_pieces(pieces)
+        if not len(whole):
+            raise _none_left(whole.name, path)
+        return _write_e57([whole], path, notes or ())
     form = las_form(pieces, modern=family == ".copc.laz", packed=family == ".laz")
     if not form.points:
-        raise OutputError(f"{form.name} has no points left, so {path.name} was not written.")
+        raise _none_left(form.name, path)
     records = (form.records(piece) for piece in pieces())
     write_las_records(path, family, form.header, records, points=form.points, hold=hold)
     return Written(
@@ -299,19 +266,27 @@ def write(
     )
 
 
-def _write_whole(cloud: Cloud, path: Path, family: str, notes: Sequence[str]) -> Written:
-    """Write a cloud as E57 or PLY."""
-    if not len(cloud):
-        raise OutputError(f"{cloud.name} has no points left, so {path.name} was not written.")
-    if family == ".e57":
-        return _write_e57([cloud], path, notes)
-    from dougong.formats.atomic import replacing
-    from dougong.formats.ply_write import ply_parts, write_ply
+def _none_left(name: str, path: Path) -> OutputError:
+    return OutputError(f"{name} has no points left, so {path.name} was not written.")
 
-    head, records, said = ply_parts(cloud)
-    with replacing(path, expected_bytes=len(head) + records.nbytes) as sink:
-        write_ply(sink, head, records)
-    return Written(path=path, points=len(records), bytes=path.stat().st_size, notes=(*notes, *said))
+
+def _write_ply(pieces: Pieces, path: Path, notes: Sequence[str]) -> Written:
+    from dougong.formats.atomic import replacing
+    from dougong.formats.ply_write import ply_parts, whole_of, write_vertices
+
+    whole, sample = whole_of(pieces)
+    if not whole.points:
+        raise _none_left(sample.name, path)
+    head, (vertex,), said = ply_parts(sample, whole)
+    expected = len(head) + whole.points * vertex.dtype.itemsize
+    with replacing(path, expected_bytes=expected) as sink:
+        sink.write(head)
+        for piece in pieces():
+            _, records, more = ply_parts(piece, whole)
+            write_vertices(sink, records)
+            said += more
+    found = tuple(dict.fromkeys([*notes, *said]))
+    return Written(path=path, points=whole.points, bytes=path.stat().st_size, notes=found)
 
 
 def write_stations(
@@ -380,14 +355,18 @@ def write_las_records(
     from dougong.formats.atomic import replacing
     from dougong.formats.copc import HELD_POINTS, CopcWriter
     from dougong.formats.las_write import LasWriter
+    from dougong.formats.unfinished import passing_folder
     from dougong.threads import ahead
 
     # Compressed points take about half; only named in the message of a full disk.
     expected = header.point_bytes * points // (1 if family == ".las" else 2)
-    with replacing(path, expected_bytes=expected + 65536) as sink:
+    most, place = hold or (HELD_POINTS, path.parent)
+    with (
+        replacing(path, expected_bytes=expected + 65536) as sink,
+        passing_folder(place / f"copc-{path.name}-") as scratch,
+    ):
         writer: CopcWriter | LasWriter
         if family == ".copc.laz":
-            most, scratch = hold or (HELD_POINTS, path.parent)
             writer = CopcWriter(sink, header, scratch=scratch, most_points=most)
         else:
             writer = LasWriter(sink, header, is_compressed=family == ".laz")

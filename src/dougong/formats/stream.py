@@ -7,7 +7,7 @@ file have the same local coordinates, digit by digit, in any order of points.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -121,6 +121,8 @@ class Survey:
     invalid: int = 0
     lacking: str = "no finite coordinates"
     """What a row that is not finite had."""
+    of_scans: list[Survey] = field(default_factory=list)
+    """How many rows of each scan are good and bad."""
 
     def add(self, block: Block) -> Mask:
         """Count a block in and return which of its rows are good."""
@@ -274,8 +276,11 @@ def survey_of(scans: Iterable[Scan], rows: int) -> Survey:
     survey = Survey()
     for scan in scans:
         survey.lacking = _lacking_of(scan)
+        mine = Survey(lacking=survey.lacking)
         for block in scan.blocks(rows):
+            mine.count(block)
             survey.add(block)
+        survey.of_scans.append(mine)
     return survey
 
 
@@ -312,6 +317,16 @@ def read_scans(scans: list[Scan], rows: int) -> list[Cloud]:
     return [
         _make(scan, lattice, *room.taken(), mine.notes())
         for scan, mine, room in gathered
+        if mine.kept
+    ]
+
+
+def scans_without_points(scans: Sequence[Any], survey: Survey) -> list[Cloud]:
+    """Return what `read_scans` returns of a surveyed file, but for the points."""
+    lattice = lattice_of(survey, scans[0].crs)
+    return [
+        _make(scan, lattice, np.empty(0, scan.dtype), np.empty((0, 3)), mine.notes())
+        for scan, mine in zip(scans, survey.of_scans, strict=True)
         if mine.kept
     ]
 

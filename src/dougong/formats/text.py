@@ -24,6 +24,7 @@ from dougong.formats.text_rows import (
     COMMENTS,
     RowFormat,
     further_counts,
+    is_last_number_cut,
     is_remark,
     number_in,
     parse_rows,
@@ -185,6 +186,11 @@ def open_text(path: Path) -> TextScan:
             layout.sample, is_pts=layout.count is not None or path.suffix.lower() == ".pts"
         )
     notes = [assumed] if assumed else []
+    if is_last_number_cut(path, sample[layout.start :].split(b"\n"), layout.rows):
+        notes.append(
+            "its last line has no end, and fewer decimals than the others: it may be cut within "
+            "its last number. Compare the file with where it came from."
+        )
     if layout.passed_over:
         notes.append(f"columns of words were not read: {', '.join(layout.passed_over)}.")
     if not {"x", "y", "z"} <= set(names):

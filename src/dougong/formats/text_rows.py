@@ -6,7 +6,7 @@ import io
 import re
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -19,6 +19,8 @@ from dougong.formats.stream import opened
 COMMENTS = (b"#", b"//", b"%", b"!")
 _BLOCK_BYTES = 1 << 26
 _FEW_LINES = 64
+_ENOUGH_LINES = 20
+_LAST_BYTES = 1 << 12
 _MISSING = ["nan", "NaN", "NAN", "-nan", "-nan(ind)", "", "null", "NULL", "NA", "None", "-", "*"]
 _PATIENCE_S = 5.0
 _COUNT_LINE = re.compile(rb"^[ \t]*(\d+)[ \t]*\r?$", re.MULTILINE)
@@ -94,6 +96,33 @@ def further_counts(path: Path, start: int, has_old_line_ends: bool) -> list[int]
             for data in _lines(file, _BLOCK_BYTES, has_old_line_ends)
             for line in _COUNT_LINE.findall(data)
         ]
+
+
+def is_last_number_cut(path: Path, sample: Sequence[bytes], layout: RowFormat) -> bool:
+    """Say whether a file that does not end its last line ends it within its last number.
+
+    That is seen where all rows of the `sample`, from its beginning, have as many decimals there.
+    """
+    with opened(path) as file:
+        file.seek(max(file.seek(0, io.SEEK_END) - _LAST_BYTES, 0))
+        end = file.read()
+    if end.endswith((b"\n", b"\r")):
+        return False
+    last = _decimals_at_end(re.split(rb"[\r\n]", end)[-1], layout)
+    usual = [_decimals_at_end(line, layout) for line in sample[:-1]]
+    known = {decimals for decimals in usual if decimals is not None}
+    if last is None or len(known) != 1 or len(usual) < _ENOUGH_LINES:
+        return False
+    return last < known.pop()
+
+
+def _decimals_at_end(line: bytes, layout: RowFormat) -> int | None:
+    """Return the decimals of the last field of a row, None where it is no row or no such number."""
+    words = split_line(line.decode("utf-8", "replace"), layout.delimiter)
+    point = "," if layout.has_decimal_comma else "."
+    whole, _, decimals = words[-1].partition(point) if words else ("", "", "")
+    is_plain = whole.lstrip("+-").isdigit() and (decimals.isdigit() or not decimals)
+    return len(decimals) if len(words) == layout.columns and is_plain else None
 
 
 def split_line(line: str, delimiter: str) -> list[str]:

@@ -261,13 +261,22 @@ def metre_form(wkt: str) -> str:
     return str(CRS.from_json_dict(document).to_wkt())
 
 
+def has_metric_format(cloud: Cloud) -> bool:
+    """Say whether a cloud was read from a format whose lengths are metres by definition."""
+    from dougong.formats.e57 import E57Header
+    from dougong.formats.ptx import PtxHeader
+
+    return isinstance(cloud.header, E57Header | PtxHeader)
+
+
 def in_system(cloud: Cloud, crs: str | None) -> Cloud:
     """Return `cloud` in the reference system that the user names for it; None: as it is.
 
     Parameters
     ----------
     cloud : Cloud
-        Of a file that names no system; its numbers then are in the units of `crs`.
+        Of a file that names no system; its numbers then are in the units of `crs`, or in metres
+        where its format has no other.
     crs : str or None
         WKT, or a code such as "EPSG:32650" (compound: "EPSG:32650+5773").
 
@@ -287,6 +296,13 @@ def in_system(cloud: Cloud, crs: str | None) -> Cloud:
             "such as EPSG:32650, or WKT."
         )
         raise InputError(msg)
+    if has_metric_format(cloud) and units_of(wkt).unit_m != METRES:
+        note = (
+            f"the reference system given for it ({units_of(wkt).name}) is in "
+            f"{units_of(wkt).names[0]}, but the coordinates of its format are metres by "
+            "definition: taken as metres."
+        )
+        wkt, cloud = metre_form(wkt), replace(cloud, notes=(*cloud.notes, note))
     frame = cloud.frame
     if frame.crs is not None:
         if is_same_crs(frame.crs, wkt):

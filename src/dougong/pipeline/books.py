@@ -76,6 +76,7 @@ class Books:
     """Opens a page by its number."""
     stages: tuple[StageCount, ...]
     notes: tuple[str, ...]
+    """What the filters said; of which cloud, who shows it says: kept books outlive its name."""
     noticed: tuple[str, ...]
     """What reading the input said."""
     page_points: int = PAGE_POINTS

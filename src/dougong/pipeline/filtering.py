@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,11 +20,13 @@ from dougong.formats import (
     write,
 )
 from dougong.formats.model import Hold
+from dougong.formats.stream import stem_of
+from dougong.formats.unfinished import passing_folder, sole_user, watched
 from dougong.params import Parameters
 from dougong.pipeline.books import Books, Tally
 from dougong.pipeline.marking import GROUND_CLASS, marked, marks_clutter, with_classes, with_clutter
-from dougong.pipeline.memory import Room
-from dougong.pipeline.outputs import finite, passing_folder, refuse_output, watched, write_json
+from dougong.pipeline.memory import Room, refuse_whole_output
+from dougong.pipeline.outputs import finite, refuse_output, write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import (
     Clock,
@@ -151,12 +153,15 @@ def filter_file(
     with clock.measure("read"):
         digest, stamp = identified(input)
     room = Room.of(memory_bytes)
-    with _places(output, work, f"{digest} {job.tiled().grid!r} in {room.bytes:.0f}") as places:
+    with _places(output, work, f"{digest} {job.tiled().grid!r}") as places:
         result: Cloud | Pieces
         if is_too_large(input, room, 0):
             progress.note(f"{input.name} is larger than memory: it is filtered on tiles")
+            if mark:  # every point is written, whatever the filters take
+                refuse_whole_output(output, describe(input).points, room)
             with clock.measure("filter"):
                 books, again = _filtered_on_tiles(input, stamp, job, room, places, progress)
+            refuse_whole_output(output, books.points if mark else books.tally().kept, room)
             result = _pieces(again, job, books, mark)
         else:
             books, result = _filtered_whole(input, stamp, job, mark, clock, progress)
@@ -165,7 +170,8 @@ def filter_file(
             with clock.measure("write"):
                 hold = Hold(room.held_points(), places.writing)
                 written = write(result, output, overwrite=overwrite, hold=hold)
-            notes = [*books.noticed, *books.notes, *written.notes]
+            said = [f"{stem_of(input)}, {note}" for note in books.notes]
+            notes = [*books.noticed, *said, *written.notes]
             document = {
                 "input": {"path": str(input), "sha256": digest, "points": books.points},
                 "output": str(output),
@@ -205,7 +211,8 @@ def _places(output: Path, work: Folder | None, facts: str) -> Iterator[_Places]:
         writing = beside / "written"
         writing.mkdir(parents=True)
         try:
-            with copies_in(beside / "copies"):
+            alone = nullcontext() if folder.local is None else sole_user(folder.local)
+            with alone, copies_in(beside / "copies"):
                 yield _Places(tiles=folder, scratch=scratch, writing=writing)
         finally:
             remove_spool(scratch)

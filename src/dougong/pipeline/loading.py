@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from dougong.errors import InputError
 from dougong.formats import describe, faults_of, in_system, read, read_stations
 from dougong.formats.faults import NO_SYSTEM
 from dougong.formats.model import Hold
+from dougong.formats.unfinished import sole_user
 from dougong.pipeline.books import Books
 from dougong.pipeline.kept import Kept
 from dougong.pipeline.marking import marks_clutter, with_clutter
@@ -168,12 +170,13 @@ class Loader:
             key = self._key(entry, digest, station)
             name = f"tiles-{self._tiles_key(entry, digest, station)}"
             folder, scratch = self.store.folder / name, self.scratch / name
-            chunks = (self._placed(entry, chunk) for chunk in raw)
+            chunks = self._chunks(entry, file, raw)
             spool = None
             if self.store.load(key) is not None:
                 self._say_known(file.stem)
             else:
-                with self.clock.measure("filter"):
+                alone = nullcontext() if folder.local is None else sole_user(folder.local)
+                with alone, self.clock.measure("filter"):
                     books, spool = filter_chunks(
                         chunks,
                         job,
@@ -184,7 +187,6 @@ class Loader:
                         scratch=scratch,
                         progress=self.progress,
                     )
-                self.require_unchanged(file)
                 self.store.save(key, books)
                 if self.store.is_temporary:
                     folder.remove()
@@ -201,6 +203,12 @@ class Loader:
             shutil.rmtree(scratch, ignore_errors=True)
             yield self._source(entry, file, station, kept, known, removed)
 
+    def _chunks(self, entry: Entry, file: Path, raw: Iterator[Cloud]) -> Iterator[Cloud]:
+        """Yield the chunks of a cloud where its entry puts it, if the file stays meanwhile."""
+        for chunk in raw:
+            yield self._placed(entry, chunk)
+        self.require_unchanged(file)
+
     def _kept(self, entry: Entry, filtered: Filtered) -> Cloud:
         """Return the kept points, with what they were taken for where that is wanted."""
         steps = steps_of(entry.kind, self.recipe)
@@ -209,14 +217,19 @@ class Loader:
     def _tiles_key(self, entry: Entry, digest: str, station: int) -> str:
         """Return the name of the tiles: a hash of what they depend on, not of later filters."""
         grid = tiled_job(steps_of(entry.kind, self.recipe)).grid
-        facts = f"{digest} for {entry.kind} in {self.room.bytes:.0f}"
+        facts = f"{self._points(entry, digest)} for {entry.kind}"
         return self.store.key(facts, station, entry.kind, grid or Recipe())[:16]
 
     def _key(self, entry: Entry, digest: str, station: int) -> str:
         params = self.recipe.lidar if entry.kind == "lidar" else self.recipe.photogrammetry
-        digest += f" in {entry.crs}" if entry.crs is not None else ""
-        digest += f" at {self.units[entry.name]!r} m" if entry.name in self.units else ""
-        return self.store.key(digest, -1 if entry.registered else station, entry.kind, params)
+        station = -1 if entry.registered else station
+        return self.store.key(self._points(entry, digest), station, entry.kind, params)
+
+    def _points(self, entry: Entry, digest: str) -> str:
+        """Return what says where the points of a file are in metres: its hash, system and unit."""
+        system = f" in {entry.crs}" if entry.crs is not None else ""
+        unit = f" at {self.units[entry.name]!r} m" if entry.name in self.units else ""
+        return digest + system + unit
 
     def _say_known(self, name: str) -> None:
         self.progress.note(f"{name}: filtered in an earlier run; not filtered again")
@@ -238,7 +251,10 @@ class Loader:
             stages=books.stages,
             points_in=books.points,
             removed=removed,
-            notes=(*(f"{file.name}: {note}" for note in books.noticed), *books.notes),
+            notes=(
+                *(f"{file.name}: {note}" for note in books.noticed),
+                *(f"{kept.name}, {note}" for note in books.notes),
+            ),
         )
 
 

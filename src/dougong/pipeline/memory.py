@@ -48,6 +48,15 @@ class Room:
         most = int(min(left / _BYTES_PER_TILE_POINT, _MOST_TILE_POINTS))
         return most if most >= LEAST_TILE_POINTS else None
 
+    def holds_tiles(self, points: int, waiting: int) -> bool:
+        """Say whether tiles that are there, `points` of which are worked on at once, fit.
+
+        What is free changes by the moment: where nobody said how much, all of it may be used
+        rather than the tiles be cut again.
+        """
+        most = self.bytes if self.is_asked else self.bytes / _SHARE
+        return tiles_bytes(points, waiting) <= most
+
     def held_points(self, waiting: int = 0) -> int:
         """Return how many points of an output may be held beside those that wait."""
         return self.most_tile_points(waiting) or LEAST_TILE_POINTS
@@ -107,6 +116,23 @@ def estimated_bytes(points: Iterable[int]) -> int:
     if not counts:
         return BASE_BYTES
     return BASE_BYTES + counts[0] * BYTES_PER_POINT + sum(counts[1:]) * BYTES_PER_WAITING_POINT
+
+
+def refuse_whole_output(output: Path, points: int, room: Room) -> None:
+    """Refuse a file of `points` that is written as a whole and needs more than ``--memory``.
+
+    Raises
+    ------
+    InputError
+        It does.
+    """
+    if output.suffix.lower() == ".e57" and room.is_asked and not room.holds(points):
+        msg = (
+            f"{output.name} is held as a whole while it is written: {points:,} points need about "
+            f"{estimated_bytes([points]) / 1e9:.1f} GB, more than {room.name()}. Raise it, or "
+            "write .laz or .ply, which are written in pieces."
+        )
+        raise InputError(msg)
 
 
 def refuse_too_large(files: Iterable[Path], memory_bytes: int | None) -> None:

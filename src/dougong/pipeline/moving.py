@@ -20,9 +20,10 @@ from dougong.formats import (
     write,
 )
 from dougong.formats.stream import opened, stem_of
+from dougong.formats.unfinished import watched
 from dougong.formats.units import METRES
 from dougong.pipeline.memory import refuse_too_large
-from dougong.pipeline.outputs import finite, refuse_output, watched
+from dougong.pipeline.outputs import finite, refuse_output
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import Stamp, require_unchanged, sha256, stamp_of
 from dougong.pipeline.registrations import Known, Unit, read_registration

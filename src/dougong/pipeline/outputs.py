@@ -14,24 +14,7 @@ import numpy as np
 from dougong.errors import InputError, OutputError
 from dougong.formats.atomic import refuse_bad_target
 from dougong.formats.registry import family_of
-from dougong.formats.unfinished import (
-    clear_left,
-    clear_parts,
-    own_mark,
-    part_of,
-)
-
-UNFINISHED: set[Path] = set()
-"""What is being written, and is removed when the process ends at once."""
-
-
-def remove_unfinished() -> None:
-    """Remove what was being written. Called when the process is about to end at once."""
-    for path in list(UNFINISHED):
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+from dougong.formats.unfinished import clear_parts, part_of
 
 
 def refuse_existing(paths: Sequence[Path], overwrite: bool) -> None:
@@ -182,37 +165,3 @@ def finite(value: Any) -> Any:
 def write_json(path: Path, document: Any) -> None:
     """Write one JSON document; NaN and infinity are refused, since JSON has neither."""
     write_text(path, json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
-
-
-@contextmanager
-def watched(*paths: Path) -> Iterator[None]:
-    """Have the unfinished forms of `paths` removed should the block be cancelled."""
-    with removed_if_cancelled(*(part_of(path) for path in paths)):
-        yield
-
-
-@contextmanager
-def removed_if_cancelled(*paths: Path) -> Iterator[None]:
-    """Have `paths` removed should the block be cancelled; else they are the caller's to remove."""
-    UNFINISHED.update(paths)
-    try:
-        yield
-    finally:
-        UNFINISHED.difference_update(paths)
-
-
-@contextmanager
-def passing_folder(head: Path) -> Iterator[Path]:
-    """Yield a folder, `head` and our mark, that is removed at the end, however the block ends.
-
-    What a killed process left under the same head goes first.
-    """
-    folder = head.with_name(head.name + own_mark())
-    clear_left(head)
-    # Our own number from an earlier life: containers count from 1 each time.
-    shutil.rmtree(folder, ignore_errors=True)
-    with removed_if_cancelled(folder):
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)

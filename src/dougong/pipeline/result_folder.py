@@ -1,7 +1,6 @@
 """The folder of a result: it appears whole or not at all, and holds one result."""
 
 import json
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -9,14 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from dougong.errors import InputError, OutputError
-from dougong.formats.unfinished import is_another_at_it, marked, own_mark
+from dougong.formats.unfinished import own_mark, refuse_another, removed_if_cancelled
 from dougong.pipeline.exports import SUFFIXES
-from dougong.pipeline.outputs import (
-    UNFINISHED,
-    behind_link,
-    refuse_existing,
-    removed_if_cancelled,
-)
+from dougong.pipeline.outputs import behind_link, refuse_existing
 from dougong.pipeline.run_document import DISTANCES
 from dougong.pipeline.writing import MERGED, REMOVED
 
@@ -68,7 +62,8 @@ def result_folder(out: Path) -> Iterator[Path]:
         msg = f"{out} is a file, and the result is a folder. Choose another --out."
         raise OutputError(msg)
     inside, *beside = _heads(behind_link(out))
-    _refuse_second_writer(out, [inside, *beside])
+    for head in (inside, *beside):
+        refuse_another(head, f"{out} is being written", "choose another --out")
     head = inside if out.exists() else beside[0]
     part = head.with_name(head.name + own_mark())
     try:
@@ -92,29 +87,6 @@ def _heads(place: Path) -> list[Path]:
     """Return how the names of unfinished results begin: in the folder, and (no root) beside it."""
     beside = [place.with_name(f".{place.name}.part-")] if place.name else []
     return [place / ".part-", *beside]
-
-
-def _refuse_second_writer(out: Path, heads: list[Path]) -> None:
-    """Refuse a folder that another process writes to; clear what a killed one left.
-
-    Raises
-    ------
-    OutputError
-        Another process is at it, or may be (on another machine).
-    """
-    if os.name != "posix":
-        return
-    for old, mark in (found for head in heads for found in marked(head)):
-        # Our own number from an earlier life (containers count from 1 each time) is stale too.
-        if old not in UNFINISHED and not is_another_at_it(mark):
-            shutil.rmtree(old, ignore_errors=True)
-            continue
-        host, _, process = mark.rpartition("-")
-        msg = (
-            f"{out} is being written by another dougong (process {process} on {host or 'a host'}). "
-            f"Wait for it or choose another --out; if it is gone, delete {old}."
-        )
-        raise OutputError(msg)
 
 
 def _move_into(part: Path, out: Path) -> None:

@@ -110,7 +110,7 @@ def _result(project: Project, loader: Loader, out: Path) -> dict[str, Any]:
     for link in linked:
         if link.measured is not None:
             write_distances(link.measured, out / DISTANCES / f"{link.mover.name}.laz")
-    merged = write_clouds(linked, reference.frame, project.merge, out, progress, clock, hold)
+    merged, said = write_clouds(linked, reference.frame, project.merge, out, progress, clock, hold)
     write_registrations(documents, linked, reference, out, loader.shown)
     asked = project.project.full_resolution
     full = _written_in_full(linked, reference, loader, out) if asked else None
@@ -140,6 +140,7 @@ def _result(project: Project, loader: Loader, out: Path) -> dict[str, Any]:
         "notes": [
             *quality_notes(quality),
             *notes_of(linked),
+            *said,
             *(f"{merged['file']}: {note}" for note in merged["notes"]),
             *full_notes(full),
         ],

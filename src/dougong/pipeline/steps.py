@@ -133,7 +133,7 @@ class Bench:
         said = [*selection.notes, *doubts(reason, taken, len(asked))]
         if reason in NOISE:
             said += self._lost_places(asked, selection.is_kept)
-        self.notes += [f"{self.cloud.name}, {name}: {note}" for note in said]
+        self.notes += [f"{name}: {note}" for note in said]
         return selection
 
     def _lost_places(self, asked: Index, is_kept: Mask) -> list[str]:

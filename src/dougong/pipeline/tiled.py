@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-import numpy as np
-
 from dougong.cloud import Cloud
 from dougong.errors import InputError
 from dougong.filters import FILTERS
@@ -73,17 +71,13 @@ def stations_of(file: Path, *, split: bool) -> Iterator[Iterator[Cloud]]:
     ------
     FormatError
         The file cannot be read.
-    InputError
-        Its scans are wanted as one cloud, but have different attributes.
     """
+    if not split:
+        yield decoded(file)
+        return
     chunks = iterate(file, CHUNK_POINTS)
-    if split:
-        for _, group in groupby(chunks, lambda cloud: getattr(cloud.header, "station", 0)):
-            yield group
-    elif len_stations(file) > 1:
-        yield _marked_with_station(chunks, file)
-    else:
-        yield chunks
+    for _, group in groupby(chunks, lambda cloud: getattr(cloud.header, "station", 0)):
+        yield group
 
 
 def decoded(file: Path) -> Iterator[Cloud]:
@@ -91,33 +85,10 @@ def decoded(file: Path) -> Iterator[Cloud]:
 
     Raises
     ------
-    FormatError, InputError
+    FormatError
         As `stations_of`.
     """
-    (chunks,) = stations_of(file, split=False)
-    return chunks
-
-
-def len_stations(file: Path) -> int:
-    """Return how many scans a file keeps apart."""
-    return describe(file).stations if file.suffix.lower() in (".e57", ".ptx") else 1
-
-
-def _marked_with_station(chunks: Iterator[Cloud], file: Path) -> Iterator[Cloud]:
-    """Give each point its station, as the whole file's reader does; all scans need one layout."""
-    layout = None
-    for chunk in chunks:
-        station = np.full(len(chunk), chunk.header.station, dtype="<u2")
-        marked = chunk.with_attribute("station", station)
-        layout = layout or marked.records.dtype
-        if marked.records.dtype != layout:
-            msg = (
-                f"{file.name} is larger than the memory that may be used, and its stations have "
-                "different attributes, which tiles cannot join. Set registered = false for it, "
-                "or raise --memory."
-            )
-            raise InputError(msg)
-        yield marked
+    return iterate(file, CHUNK_POINTS, as_one=True)
 
 
 def filter_chunks(
@@ -152,7 +123,8 @@ def filter_chunks(
     waiting : int
         Points of clouds that are held meanwhile.
     folder : Folder
-        Gets the tiles. Those that an earlier run left there are gone on with.
+        Gets the tiles. Those that an earlier run left there are gone on with, if there is room for
+        tiles of their size.
     scratch : Path
         Gets the cloud and, while it is cut, its coordinates once more, then the books; may be the
         same folder.
@@ -168,7 +140,9 @@ def filter_chunks(
     start = time.perf_counter()
     with engine_in_use() as engine:
         tiles, spool = load_tiles(folder), None
-        if tiles is None:
+        if tiles is None or not room.holds_tiles(
+            tiles.facts["most_points"] * HALO_SHARE * engine.width, waiting
+        ):
             most = room.tile_points(points, waiting)
             kept = max(most // (HALO_SHARE * engine.width), 1)
             spool = _spooled(chunks, folder, scratch)
@@ -197,7 +171,7 @@ def _run_steps(
             params = params.shifted(bench.cloud.facts["origin"])
         done = bench.apply(step.name, params, step.among)
         said = [*done.notes, *doubts(FILTERS[step.name].reason, done.taken, done.asked)]
-        notes += [f"{name}, {step.name}: {note}" for note in said]
+        notes += [f"{step.name}: {note}" for note in said]
         stages.append(
             StageCount(
                 name=step.name,
@@ -230,6 +204,7 @@ def _cut(
     told = {
         "name": first.name,
         "notes": list(first.notes),
+        "most_points": most_kept,
     }
     return partition(spool, job.grid, folder, most, most_kept, told)
 

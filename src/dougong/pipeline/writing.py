@@ -6,7 +6,7 @@ from typing import Any
 
 from dougong.cloud import Cloud, Frame, Pieces, in_pieces
 from dougong.formats import write, write_merged
-from dougong.formats.model import Hold
+from dougong.formats.model import Hold, Written
 from dougong.pipeline.distances import Painter
 from dougong.pipeline.exports import Ends, write_registration
 from dougong.pipeline.left_out import Remaining
@@ -28,8 +28,17 @@ def write_clouds(
     progress: Progress,
     clock: Clock,
     hold: Hold,
-) -> dict[str, Any]:
-    """Write each filtered cloud and the merged one; return what the merged one holds."""
+) -> tuple[dict[str, Any], list[str]]:
+    """Write each filtered cloud and the merged one.
+
+    Returns
+    -------
+    merged : dict
+        What the merged one holds, its notes included.
+    notes : list of str
+        What the files of clouds that are not merged could not hold.
+    """
+    notes: list[str] = []
     parts: list[Part] = []
     painted: list[Pieces] = []
     measured = [link.measured for link in linked if link.measured is not None]
@@ -38,12 +47,13 @@ def write_clouds(
         kept = [source.kept for source in link.mover.sources]
         clouds = [link.placed_pieces(one, reference) for one in kept]
         with clock.measure("write"):
-            _write_one(clouds, out / "clouds" / f"{link.mover.name}.laz", source_id, hold)
+            written = _write_one(clouds, out / "clouds" / f"{link.mover.name}.laz", source_id, hold)
         removed = [source.removed for source in link.mover.sources if len(source.removed)]
         if removed:
             placed = [in_pieces(link.placed(cloud, reference)) for cloud in removed]
             _write_one(placed, out / REMOVED / f"{link.mover.name}.laz", source_id, hold)
         if not link.is_sure:
+            notes += [f"clouds/{written.path.name}: {note}" for note in written.notes]
             continue
         own = measured if link.result is None else [link.measured] if link.measured else []
         paint = Painter(own) if measured else None
@@ -59,7 +69,7 @@ def write_clouds(
                 )
             )
             painted.append(pieces if paint is None else paint.pieces(pieces))
-    return _write_merged(parts, painted, merge, out, progress, clock, hold)
+    return _write_merged(parts, painted, merge, out, progress, clock, hold), notes
 
 
 def _write_merged(
@@ -116,12 +126,11 @@ def _left(pieces: Pieces, remaining: Remaining) -> Pieces:
     return left
 
 
-def _write_one(clouds: Sequence[Pieces], path: Path, source_id: int, hold: Hold) -> None:
+def _write_one(clouds: Sequence[Pieces], path: Path, source_id: int, hold: Hold) -> Written:
     path.parent.mkdir(exist_ok=True)
     if len(clouds) == 1:
-        write(clouds[0], path, hold=hold)
-    else:
-        write_merged(clouds, path, source_ids=[source_id] * len(clouds), hold=hold)
+        return write(clouds[0], path, hold=hold)
+    return write_merged(clouds, path, source_ids=[source_id] * len(clouds), hold=hold)
 
 
 def write_registrations(

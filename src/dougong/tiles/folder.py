@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, Protocol
 
 from dougong.errors import OutputError
-from dougong.formats.unfinished import part_of
+from dougong.formats.unfinished import clear_all_parts, part_of, refuse_removed
 
 Fill = Callable[[IO[bytes]], object]
 """Writes what a file shall hold."""
@@ -106,9 +106,11 @@ class LocalFolder:
     def write(self, name: str, fill: Fill) -> None:
         """Write a file beside its place and rename it there."""
         path = self.path / name
+        refuse_removed(path)
         part = part_of(path)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
+            clear_all_parts(self.path)
             with part.open("wb") as file:
                 fill(file)
                 file.flush()

@@ -25,7 +25,8 @@ from dougong.evaluation.bench.contenders import OPERATIONS, Contender, absent
 from dougong.evaluation.bench.scenes import SCENES
 from dougong.evaluation.bench.table import as_text
 from dougong.evaluation.machine import code_hash, machine, version_of
-from dougong.pipeline.outputs import watched, write_json
+from dougong.formats.unfinished import watched
+from dougong.pipeline.outputs import write_json
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import software
 

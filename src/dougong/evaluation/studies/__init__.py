@@ -20,7 +20,8 @@ import dougong
 from dougong.errors import InputError, OutputError
 from dougong.evaluation.machine import code_hash, machine
 from dougong.evaluation.tabulate import new_figure
-from dougong.pipeline.outputs import finite, refuse_existing, watched, write_json, write_text
+from dougong.formats.unfinished import watched
+from dougong.pipeline.outputs import finite, refuse_existing, write_json, write_text
 from dougong.pipeline.progress import Progress
 from dougong.pipeline.provenance import software
 from dougong.threads import get_threads
