@@ -272,9 +272,12 @@ def test_the_result_hash_forgets_time_paths_and_point_order(folder, capsys):
 def test_a_copy_of_a_file_is_said(folder, capsys, monkeypatch):
     monkeypatch.setattr("dougong.pipeline.links.register", answer("ok"))
     (folder / "two.laz").write_bytes((folder / "one.laz").read_bytes())
-    code, result = run(capsys, clouds(folder), "--out", folder / "out")
-    assert code == 0
-    assert any("two.laz is a copy of one.laz" in note for note in result["notes"])
+    one, two = ("--lidar", folder / "one.laz"), ("--lidar", folder / "two.laz")
+    assert call([str(part) for part in ("run", *one, *two, "--out", folder / "out", "--json")]) == 0
+    said = capsys.readouterr()
+    notes = json.loads(said.out)["notes"]
+    assert "two.laz is a copy of one.laz: the same points are given twice" in " ".join(notes)
+    assert "filtered before, from its copy; not filtered again" in said.err
 
 
 def test_registering_a_file_onto_its_copy_is_said(folder, capsys, monkeypatch):

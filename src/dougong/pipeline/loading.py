@@ -58,6 +58,8 @@ class Loader:
     """Filtered points that wait in memory."""
     units: dict[str, float | None] = field(default_factory=dict)
     """Metres per unit of the project's clouds whose scale was searched; None: none was found."""
+    saved: set[str] = field(default_factory=set)
+    """Keys of the filtered clouds that this run has put into its store."""
 
     def hold(self) -> Hold:
         """Return how many points may be held beside those that wait, and where the others go."""
@@ -102,7 +104,7 @@ class Loader:
         self.inputs[file] = {"path": self.shown(file), "sha256": digest, "points": 0}
         for source in _naming(file, found):
             if twin is not None:
-                said = f"{file.name} is a copy of {twin.name}: its points are in the result twice"
+                said = f"{file.name} is a copy of {twin.name}: the same points are given twice"
                 source = replace(source, notes=(*source.notes, said))
             self.inputs[file]["points"] += source.points_in
             self.waiting += source.kept.points if source.kept.is_held else 0
@@ -149,14 +151,14 @@ class Loader:
             key = self._key(entry, digest, station)
             books = self.store.load(key)
             if books is not None and books.points == len(cloud):
-                self._say_known(cloud.name)
+                self._say_known(cloud.name, key)
                 ((_, filtered),) = books.along((cloud,))
             else:
                 with self.clock.measure("filter"):
                     noticed = self._noticed(entry, cloud)
                     filtered = filter_cloud(cloud, entry.kind, self.recipe, self.progress)
                 books = Books.of(filtered, noticed)
-                self.store.save(key, books)
+                self._save(key, books)
             removed = removed_sample(cloud, filtered.codes, details=filtered.details)
             kept = Kept.of(self._kept(entry, filtered))
             yield self._source(entry, file, station, kept, books, removed)
@@ -173,7 +175,7 @@ class Loader:
             chunks = self._chunks(entry, file, raw)
             spool = None
             if self.store.load(key) is not None:
-                self._say_known(file.stem)
+                self._say_known(file.stem, key)
             else:
                 alone = nullcontext() if folder.local is None else sole_user(folder.local)
                 with alone, self.clock.measure("filter"):
@@ -187,7 +189,7 @@ class Loader:
                         scratch=scratch,
                         progress=self.progress,
                     )
-                self.store.save(key, books)
+                self._save(key, books)
                 if self.store.is_temporary:
                     folder.remove()
             known = self.store.load(key)
@@ -231,8 +233,13 @@ class Loader:
         unit = f" at {self.units[entry.name]!r} m" if entry.name in self.units else ""
         return digest + system + unit
 
-    def _say_known(self, name: str) -> None:
-        self.progress.note(f"{name}: filtered in an earlier run; not filtered again")
+    def _save(self, key: str, books: Books) -> None:
+        self.store.save(key, books)
+        self.saved.add(key)
+
+    def _say_known(self, name: str, key: str) -> None:
+        when = "before, from its copy" if key in self.saved else "in an earlier run"
+        self.progress.note(f"{name}: filtered {when}; not filtered again")
 
     def _source(
         self,
