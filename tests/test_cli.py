@@ -513,7 +513,6 @@ def test_a_wrong_project_is_told_in_words_and_without_its_contents(text, said, t
     assert "{" not in err
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a Linux device")
 @pytest.mark.parametrize("count", [1, 20])
 def test_register_writes_its_document_where_a_cloud_is_too_small(room, tmp_path, capsys, count):
     few = tmp_path / "few.laz"
@@ -546,6 +545,7 @@ def test_register_and_run_do_not_write_over_each_others_report(room, tmp_path, c
     assert (out / "report.html").read_text() == "of another command"
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a Linux device")
 @pytest.mark.parametrize(
     ("redirect", "code", "said"),
     [

@@ -135,6 +135,19 @@ def test_sigmas_that_are_too_small_make_no_third_of_the_points_bad():
         assert control.used.all()
 
 
+@pytest.mark.parametrize(("count", "bad"), [(5, 1), (5, 2), (7, 2), (7, 3)])
+def test_blunders_are_found_as_long_as_they_are_few_enough(count, bad):
+    T, found = motion(), 0
+    for seed in range(20):
+        control = points(T, checks=0, seed=seed, places=PLACES[:count])
+        for name in control.names[:bad]:
+            off = np.random.default_rng((seed, int(name[1:]))).normal(size=3)
+            control = spoilt(control, name, off / np.linalg.norm(off))
+        used = local(control, T)[0].used
+        found += bool(used[bad:].all() and not used[:bad].any())
+    assert found >= 16
+
+
 def test_points_of_another_frame_are_refused():
     T = motion()
     far = points(T)

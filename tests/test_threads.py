@@ -1,6 +1,7 @@
 """Blocks are fanned out whole, in fixed pieces, and errors come back."""
 
 import threading
+import time
 
 import pytest
 
@@ -73,18 +74,25 @@ def test_an_error_of_one_of_many_jobs_is_raised(workers):
         threads.each(lambda item: 1 / (item - 7), range(50))
 
 
-def test_jobs_for_all_threads_cut_nothing_further(workers):
-    """Each of 6 jobs does its blocks where it is; each of 2, with 3 threads, fans them out."""
+@pytest.mark.parametrize("jobs", [1, 2, 3, 8])
+def test_jobs_share_the_threads_and_never_use_more(workers, jobs):
+    """Each of two jobs had as many threads as there are, for itself."""
+    lock, now, most = threading.Lock(), 0, 0
 
-    def hands(_):
-        seen = set()
-        threads.for_blocks(40, 1, lambda *_: seen.add(threading.get_ident()))
-        return seen == {threading.get_ident()}
+    def block(*_):
+        nonlocal now, most
+        with lock:
+            now += 1
+            most = max(most, now)
+        time.sleep(0.002)
+        with lock:
+            now -= 1
 
-    assert all(threads.each(hands, range(6)))
-    assert not any(threads.each(hands, range(2))) or workers == 1
-    # Whoever fanned them out is as free as before.
-    assert not hands(0) or workers == 1
+    threads.each(lambda _: threads.for_blocks(6, 1, block), range(jobs))
+    assert 1 <= most <= workers
+    seen = set()
+    threads.for_blocks(6, 1, lambda *_: seen.add(threading.get_ident()))
+    assert (threading.get_ident() in seen) == (workers == 1), "who fanned out is as free as before"
 
 
 def test_many_jobs_run_at_the_same_time():

@@ -1,7 +1,8 @@
-"""How many threads the kernels use, and the one way they are fanned out.
+"""How many threads are used, and the ways that work is fanned out to them.
 
 Kernels are serial and release the GIL; they run over fixed blocks on a thread pool. The blocks
 do not depend on the thread count, so neither does any result, and Ctrl-C works between blocks.
+Jobs of Python that are too small for blocks, and many, run side by side (`each`).
 """
 
 import os
@@ -19,7 +20,7 @@ _threads = max(
 
 
 _here = threading.local()
-"""Of each thread: whether it is one of those of `each`, which fan out nothing further."""
+"""Of each thread: its share of the threads, where it is one of those of `each`."""
 
 
 def set_threads(count: int) -> None:
@@ -38,12 +39,12 @@ def for_blocks(count: int, block: int, task: Callable[[int, int], None]) -> None
 
     The first exception is raised; blocks not started by then are dropped.
     """
-    starts = range(0, count, block)
-    if _threads == 1 or len(starts) <= 1 or getattr(_here, "is_one_of_many", False):
+    starts, threads = range(0, count, block), _own_threads()
+    if threads == 1 or len(starts) <= 1:
         for start in starts:
             task(start, min(start + block, count))
         return
-    with ThreadPoolExecutor(_threads) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         futures = [pool.submit(task, start, min(start + block, count)) for start in starts]
         try:
             for future in futures:
@@ -57,14 +58,15 @@ def each(do: Callable[[Item], Made], items: Iterable[Item]) -> list[Made]:
     """Return ``do(item)`` of all items, in their order, several at a time on the threads.
 
     For jobs that spend much of their time outside of blocks: a pose's fit, a cloud's description.
-    What they cut into blocks stays in their thread where there are jobs for all threads. The first
-    exception is raised; jobs not started by then are dropped.
+    The jobs share the threads: what one cuts into blocks goes to its own share. The first exception
+    is raised; jobs not started by then are dropped, and those that run come to their end.
     """
-    todo = list(items)
-    if _threads == 1 or len(todo) <= 1 or getattr(_here, "is_one_of_many", False):
+    todo, threads = list(items), _own_threads()
+    at_once = min(threads, len(todo))
+    if at_once <= 1:
         return [do(item) for item in todo]
-    start = _be_one_of_many if len(todo) >= _threads else None
-    with ThreadPoolExecutor(_threads, initializer=start) as pool:
+    share = threads // at_once
+    with ThreadPoolExecutor(at_once, initializer=_take_share, initargs=(share,)) as pool:
         futures = [pool.submit(do, item) for item in todo]
         try:
             return [future.result() for future in futures]
@@ -73,8 +75,13 @@ def each(do: Callable[[Item], Made], items: Iterable[Item]) -> list[Made]:
             raise
 
 
-def _be_one_of_many() -> None:
-    _here.is_one_of_many = True
+def _own_threads() -> int:
+    """Return how many threads the thread that asks may use: all, or its share in `each`."""
+    return getattr(_here, "share", _threads)
+
+
+def _take_share(share: int) -> None:
+    _here.share = share
 
 
 def ahead(items: Iterable[Item]) -> Iterator[Item]:

@@ -127,15 +127,19 @@ class Survey:
     def add(self, block: Block) -> Mask:
         """Count a block in and return which of its rows are good."""
         is_ok = self.count(block)
+        self.widen(block, is_ok)
+        return is_ok
+
+    def widen(self, block: Block, is_ok: Mask) -> None:
+        """Take in where the good rows (n,) of a block lie."""
         if not is_ok.any():
-            return is_ok
+            return
         good = block.coordinates if is_ok.all() else block.coordinates[is_ok]
         for axis in range(3):
             column = np.ascontiguousarray(good[:, axis])
             self.low[axis] = min(self.low[axis], column.min())
             self.high[axis] = max(self.high[axis], column.max())
             self.decimals[axis] = decimals_of(column, self.decimals[axis])
-        return is_ok
 
     def count(self, block: Block) -> Mask:
         """Count the rows of a block, good and bad, and return which are good."""
@@ -278,8 +282,11 @@ def survey_of(scans: Iterable[Scan], rows: int) -> Survey:
         survey.lacking = _lacking_of(scan)
         mine = Survey(lacking=survey.lacking)
         for block in scan.blocks(rows):
-            mine.count(block)
-            survey.add(block)
+            survey.widen(block, mine.count(block))
+        survey.rows += mine.rows
+        survey.not_finite += mine.not_finite
+        survey.too_far += mine.too_far
+        survey.invalid += mine.invalid
         survey.of_scans.append(mine)
     return survey
 

@@ -1,4 +1,6 @@
-"""Names of what is not finished: they say who writes it, so that what a killed process left goes.
+"""What is not finished: its names say who writes it, so that what a killed process left goes.
+
+Also who works where (`sole_user`), and what is removed when a job is cancelled.
 
 Such a name ends in `-<machine>-<process>`. The next one that writes to the same place removes what
 a process of this machine left that runs no longer; it lets be what another machine may be at.
@@ -141,7 +143,7 @@ def passing_folder(head: Path) -> Iterator[Path]:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def refuse_another(head: Path, at: str, otherwise: str) -> None:
+def refuse_another(head: Path, at: str, otherwise: str, mine: Path | None = None) -> None:
     """Refuse to begin `head` and our mark beside another process; clear what a killed one left.
 
     Parameters
@@ -149,6 +151,8 @@ def refuse_another(head: Path, at: str, otherwise: str) -> None:
     head : Path
     at, otherwise : str
         What another one is at, and what to do but wait for it, for the message.
+    mine : Path, optional
+        Our own mark, where it is there already: only who was there before it is another one.
 
     Raises
     ------
@@ -158,6 +162,8 @@ def refuse_another(head: Path, at: str, otherwise: str) -> None:
     if os.name != "posix":
         return
     for path, mark in marked(head):
+        if mine is not None and (path == mine or _was_first(mine, path)):
+            continue
         # Our own number from an earlier life (containers count from 1 each time) is stale too.
         if path not in _begun and not is_another_at_it(mark):
             _remove(path)
@@ -168,6 +174,18 @@ def refuse_another(head: Path, at: str, otherwise: str) -> None:
             f"Wait for it or {otherwise}; if it is gone, delete {path}."
         )
         raise OutputError(msg)
+
+
+def _was_first(one: Path, other: Path) -> bool:
+    """Say whether `one` was made before `other`, or that is gone; of two at once, by their names.
+
+    Both processes come to the same answer.
+    """
+    try:
+        made = other.stat().st_mtime_ns
+    except FileNotFoundError:
+        return True
+    return (one.stat().st_mtime_ns, one.name) < (made, other.name)
 
 
 @contextmanager
@@ -191,6 +209,8 @@ def sole_user(folder: Path) -> Iterator[None]:
             msg = f"{folder.parent} could not be written: {error.strerror or error}. {_ELSEWHERE}"
             raise OutputError(msg) from error
         try:
+            # Once more: of two that begin at once each sees the other's mark now.
+            refuse_another(head, at, otherwise, mine=mark)
             yield
         finally:
             mark.unlink(missing_ok=True)

@@ -153,9 +153,11 @@ def filter_file(
     with clock.measure("read"):
         digest, stamp = identified(input)
     room = Room.of(memory_bytes)
-    with _places(output, work, f"{digest} {job.tiled().grid!r}") as places:
+    on_tiles = is_too_large(input, room, 0)
+    facts = f"{digest} {job.tiled().grid!r}"
+    with _places(output, work, facts, is_alone=on_tiles) as places:
         result: Cloud | Pieces
-        if is_too_large(input, room, 0):
+        if on_tiles:
             progress.note(f"{input.name} is larger than memory: it is filtered on tiles")
             if mark:  # every point is written, whatever the filters take
                 refuse_whole_output(output, describe(input).points, room)
@@ -198,10 +200,10 @@ class _Places:
 
 
 @contextmanager
-def _places(output: Path, work: Folder | None, facts: str) -> Iterator[_Places]:
+def _places(output: Path, work: Folder | None, facts: str, *, is_alone: bool) -> Iterator[_Places]:
     """Yield where tiles go: in `work`, named by what they depend on, else beside the output.
 
-    What is beside the output goes again.
+    What is beside the output goes again. With `is_alone` no other process may work there.
     """
     told = f"{dougong.__version__} {facts}"
     key = hashlib.sha256(told.encode()).hexdigest()[:16]
@@ -211,7 +213,7 @@ def _places(output: Path, work: Folder | None, facts: str) -> Iterator[_Places]:
         writing = beside / "written"
         writing.mkdir(parents=True)
         try:
-            alone = nullcontext() if folder.local is None else sole_user(folder.local)
+            alone = sole_user(folder.local) if is_alone and folder.local else nullcontext()
             with alone, copies_in(beside / "copies"):
                 yield _Places(tiles=folder, scratch=scratch, writing=writing)
         finally:

@@ -345,7 +345,7 @@ def from_files(lidar: Sequence[Path], photogrammetry: Sequence[Path]) -> Project
         raise InputError(msg)
     # Not behind links: what they lead to may have no suffix (as in a cache of data versions).
     clouds = [
-        {"name": stem_of(path), "kind": kind, "files": [str(path.absolute())]}
+        {"name": stem_of(path), "kind": kind, "files": [str(path.parent.resolve() / path.name)]}
         for kind, path in kinds
     ]
     return validated(Project, {"cloud": clouds}, "the clouds named on the command line")

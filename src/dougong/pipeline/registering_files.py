@@ -101,7 +101,7 @@ def register_files(
         target=two.cloud.name,
         source_frame=one.cloud.frame,
         target_frame=two.cloud.frame,
-        files=[str(source.absolute())],
+        files=[str(source.parent.resolve() / source.name)],
     )
     write_registration(out, "registration", document, ends)
     return document

@@ -22,6 +22,8 @@ from dougong.typing import Mask, Points, Transform, Values
 FEWEST_FOR_POSE = 3
 RIGID, SIMILAR = (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4, 5, 6)
 _THIN = 0.03
+BLUNDER_M = 0.1
+"""More than a third of the points may be bad, if each misses its place by more than this."""
 _ZERO = np.zeros((7, 7))
 _REJECT = float(np.sqrt(stats.chi2.isf(1e-3, 3) / 3.0))
 """Normalised residual, of three coordinates together, of a bad point: 1 in 1000 is as large by
@@ -86,8 +88,14 @@ def own_pose(
             return None
         return _worst(T, points, left, _ZERO, points.target[left].mean(axis=0), free)
 
-    used = _without_bad(worst, used, FEWEST_FOR_POSE)
-    return _weighted_pose(points, used, free), used
+    count = int(used.sum())
+    left = _without_bad(worst, used, FEWEST_FOR_POSE, (count - 1) // 2)
+    T, out = _weighted_pose(points, left, free), used & ~left
+    # Too small a sigma makes sound points bad, but not by decimetres.
+    is_many = int(out.sum()) > max(1, count // 3)
+    if is_many and (T is None or miss(T, points, out).min() <= BLUNDER_M):
+        return _weighted_pose(points, used, free), used
+    return T, left
 
 
 def joint(
@@ -115,7 +123,10 @@ def joint(
         Which unknowns move.
     """
     used = _without_bad(
-        lambda left: _worst(clouds, points, left, information, centre, free), used, fewest=1
+        lambda left: _worst(clouds, points, left, information, centre, free),
+        used,
+        fewest=1,
+        most=max(1, int(used.sum()) // 3),
     )
     T, at, covariance = clouds, np.zeros(7), _ZERO
     for _ in range(10):
@@ -265,14 +276,13 @@ def _worst(
     return bad
 
 
-def _without_bad(worst: Callable[[Mask], int | None], used: Mask, fewest: int) -> Mask:
+def _without_bad(worst: Callable[[Mask], int | None], used: Mask, fewest: int, most: int) -> Mask:
     """Return `used` without the points that all others contradict, the `worst` of those left first.
 
-    At most a third of them (but one of two) can be bad: if more are, their sigmas are too small or
-    it is the clouds that differ, and all are left in to say so.
+    At most `most` can be bad: if more are, it is the clouds that differ or the sigmas that are too
+    small, and all are left in to say so. No fewer than `fewest` are left.
     """
     left = used.copy()
-    most = max(1, int(used.sum()) // 3)
     while int(left.sum()) > fewest:
         bad = worst(left)
         if bad is None:

@@ -148,11 +148,12 @@ def _registered(
         clock.lap("coarse")
         return _Tried(one, two, starts, decide(one, two, starts, params, clock, surveyed))
 
-    thinned = each(lambda cloud: thin(cloud, settings), (source, target))
+    # One after the other: together they would hold twice what one needs beyond its points.
+    thinned = [thin(cloud, settings) for cloud in (source, target)]
     best = tried(thinned)
     if best.is_refused:
         # Among many strays a true pose explains little: it is asked again without them.
-        without = each(Thinned.without_strays, thinned)
+        without = [cloud.without_strays() for cloud in thinned]
         again = tried(without) if without != thinned else best
         best = best if again.is_refused else again
     one, two, starts, found = best

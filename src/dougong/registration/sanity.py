@@ -14,8 +14,6 @@ from dougong.typing import Points, Values
 UNIT_RATIOS = {1000.0: "millimetres", 304.8: "millimetres and the other one in feet"}
 """Ratios of two lengths that betray two units, and what the larger number is likely in."""
 
-_FEET = 1.0 / 0.3048
-
 _MIRROR_LEAD = 1.25
 _MIRROR_MIN = 0.4
 _WILD = 20.0
@@ -94,8 +92,8 @@ def propose_scale(source: Cloud, target: Cloud) -> ScaleProposal | None:
 
     Sizes are the heights and widths of the boxes without far points. One site surveyed twice
     can differ a lot (one facade against a whole site), so only wild differences speak: above 20
-    in width *and* height. A ratio of 3.28 hides within what partial overlap does to sizes; the
-    search with a free scale finds it.
+    in width *and* height. A ratio of 3.28 hides within what partial overlap does to sizes;
+    where nothing declares a unit the search with a free scale finds it.
     """
     one, other = _size(source.xyz), _size(target.xyz)
     if min(*one, *other) <= 0.0:

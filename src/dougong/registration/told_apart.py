@@ -90,7 +90,9 @@ def told_by_control(
     if not left:
         return ruling
     again = rule(court, levels, left, icp, params, lambda T: not control.refutes(T))
-    return ruling if control.refutes(again.winner.T) else again
+    if control.refutes(again.winner.T):
+        return ruling
+    return replace(again, overruled=again.overruled or ruling.overruled)
 
 
 def without_refuted(ruling: Ruling, control: Control) -> Ruling:
