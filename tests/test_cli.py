@@ -281,7 +281,7 @@ def test_a_registration_that_failed_is_never_applied(room, capsys):
     path.write_text(json.dumps({"status": "failed", "matrix": np.eye(4).tolist(), "reason": "No."}))
     tokens = ["transform", str(room), str(room.with_name("t.laz")), "--matrix", str(path)]
     assert call([*tokens, "--accept-best", "--quiet"]) == 1
-    assert "the registration failed, there is no pose to apply. No." in capsys.readouterr().err
+    assert "the registration failed, there is no pose to apply: No." in capsys.readouterr().err
     assert not room.with_name("t.laz").exists()
 
 

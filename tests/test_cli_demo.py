@@ -142,6 +142,16 @@ def test_transform_repeats_what_the_run_did(demo, tmp_path, capsys):
     assert crs_of(moved) == crs_of(out / "scene" / "drone.laz")
 
 
+def test_transform_refuses_the_cloud_that_stays(demo, tmp_path, capsys):
+    """The drone cloud was moved by the matrix of the scan, with a hint that it may be so twice."""
+    out, _ = demo
+    tokens = ("transform", out / "scene" / "drone.laz", tmp_path / "moved.laz")
+    code, answer = run(capsys, *tokens, "--matrix", out / "registrations" / "lidar.json")
+    assert code == 2
+    assert "is drone, onto which lidar was registered: it stays" in answer["error"]["message"]
+    assert not (tmp_path / "moved.laz").exists()
+
+
 @pytest.mark.parametrize("status", ["ambiguous", "failed"])
 def test_transform_refuses_a_pose_that_is_not_sure(demo, status, tmp_path, capsys):
     out, _ = demo

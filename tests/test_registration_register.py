@@ -64,6 +64,15 @@ def test_a_field_of_a_part_that_would_have_no_effect_is_refused(part, field, val
         Register.model_validate({part: {field: value}})
 
 
+def test_a_hint_that_nothing_fits_is_named():
+    """It was asked whether both clouds show one place."""
+    T = motion(80.0)
+    scan, drone = as_cloud(site("lidar", 0)), as_cloud(moved(site("photogrammetry", 1), T))
+    found = register(scan, drone, Register(prepare=SETTINGS, yaw_hint_deg=200.0))
+    assert found.status == "failed"
+    assert "Only turns within 15 deg of the yaw hint, 200, were searched" in found.reason
+
+
 def test_bands_of_height_ascend():
     for edges in ((8.0, 4.0, 2.0), (2.0, 2.0)):
         with pytest.raises(ValidationError, match="do not ascend"):

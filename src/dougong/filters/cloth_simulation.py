@@ -18,7 +18,7 @@ from dougong._checks import as_points
 from dougong._words import of_all
 from dougong.errors import InputError
 from dougong.filters.extent import plan_box_of
-from dougong.filters.low_outliers import LowOutliers, find_levels, is_low_outlier, low_notes
+from dougong.filters.low_outliers import LowOutliers, find_levels, is_low_outlier
 from dougong.filters.selection import Selection
 from dougong.kernels import cloth as cloth_kernels
 from dougong.kernels import raster
@@ -168,7 +168,10 @@ def cloth_simulation(points: Points, params: ClothSimulation | None = None) -> S
 
 def cloth_notes(low: int, lost: int, points: int) -> tuple[str, ...]:
     """Return what is to be said where of all `points` so many are low, and without a height."""
-    notes = low_notes(low, points)
+    notes: tuple[str, ...] = ()
+    if low:
+        said = of_all(low, points, "lies", "lie")
+        notes = (f"{said} below the ground, which is laid without them; they stay",)
     if lost:
         said = of_all(lost, points, "is", "are")
         notes += (f"{said} too far from any ground for a height",)

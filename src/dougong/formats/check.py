@@ -212,7 +212,7 @@ def _of_points(path: Path, info: FileInfo, tally: _Tally) -> list[Finding]:
     is_inside_origin = bool(((-origin >= low) & (-origin <= high)).all())
     if tally.at_origin and (tally.at_origin > 1 or not is_inside_origin):
         text = (
-            f"{path.name}: {tally.at_origin} points are exactly at 0, 0, 0, as scanners write "
+            f"{path.name}: {tally.at_origin:,} points are exactly at 0, 0, 0, as scanners write "
             "missing returns. Drop them."
         )
         found.append(Finding("warning", text))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from dougong.cloud import Frame
-from dougong.errors import FormatError, FrameError
+from dougong.errors import FormatError, FrameError, InputError
 from dougong.formats import (
     can_reissue,
     describe,
@@ -44,7 +44,8 @@ def transform_file(
     Raises
     ------
     InputError
-        The registration is not sure and `accept_best` is False, or the output exists.
+        The registration is not sure and `accept_best` is False, the output exists, or the file is
+        the one that stays.
     RegistrationError
         The registration failed: there is no pose.
     FormatError
@@ -110,6 +111,7 @@ def _doubts(input: Path, scans: int, known: Known) -> list[str]:
     FrameError
         As `transform_file`.
     """
+    _refuse_target(input, known)
     crs, unit_m = system_in(input)
     _require_unit(input, crs, unit_m, known)
     notes = [*known.notes, *_file_notes(input, known), *_system_notes(input, crs, unit_m, known)]
@@ -128,6 +130,25 @@ def _doubts(input: Path, scans: int, known: Known) -> list[str]:
             "all of them are moved by it, which is right only if they lie in one frame"
         )
     return notes
+
+
+def _refuse_target(input: Path, known: Known) -> None:
+    """Refuse the file onto which another one was registered.
+
+    Raises
+    ------
+    InputError
+        It is that.
+    """
+    registered = {stem_of(Path(str(one.get("path")))): one.get("sha256") for one in known.inputs}
+    digest = registered.get(known.target)
+    if digest is None or digest == registered.get(known.source) or sha256(input) != digest:
+        return
+    msg = (
+        f"{input.name} is {known.target}, onto which {known.source} was registered: it stays, and "
+        f"the matrix is for {known.source}."
+    )
+    raise InputError(msg)
 
 
 def _require_unit(input: Path, crs: str | None, unit_m: Unit | None, known: Known) -> None:

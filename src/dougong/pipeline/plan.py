@@ -141,7 +141,7 @@ def _planned(
             need = estimated_bytes([told.points, waiting])
             refusal = (
                 f"{path}: {told.points:,} points need about {need / 1e9:.1f} GB, more than "
-                f"{room.name()}. Raise it, or decimate the cloud first."
+                f"{room.name()}, however small the tiles. Raise it."
             )
     planned = PlannedFile(
         path=path,

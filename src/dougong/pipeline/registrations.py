@@ -134,7 +134,7 @@ def _require_pose(document: Mapping[str, Any], path: Path, accept_best: bool) ->
         raise InputError(msg)
     if status == "failed" or document["matrix"] is None:
         reason = document.get("reason", "")
-        msg = f"{path}: the registration failed, there is no pose to apply. {reason}"
+        msg = f"{path}: the registration failed, there is no pose to apply: {reason}"
         raise RegistrationError(msg)
     if status != "ok" and not accept_best:
         msg = (

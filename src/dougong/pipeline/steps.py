@@ -172,7 +172,7 @@ class Bench:
 def nothing_kept(name: str, points: int, stages: Sequence[StageCount]) -> str:
     """Return what is said where no point is left."""
     return (
-        f"{name}: the filters kept none of {points} points. "
+        f"{name}: the filters kept none of {points:,} points. "
         "Look at the stage that took them all and loosen it: "
         + ", ".join(f"{stage.name} {stage.points_out}" for stage in stages)
         + "."

@@ -190,7 +190,8 @@ def _doubted(
             return None
         if hand == "open":
             status, reason, evidence = "ambiguous", OPEN_SENTENCE, _with_one_more(evidence)
-        reason += " Its mirror image fits as well." if hand == "unknown" else ""
+        if hand == "unknown":
+            reason += " Its mirror image fits as well: what both clouds show is symmetric."
         clock.lap("mirror check")
     if status == "ok" and not is_near_hint(heard.T, params):
         status, reason = "ambiguous", _off_hint(heard.T, params)

@@ -165,6 +165,8 @@ def _registered(
         mirror = is_mirrored(one, two, starts, params.plan)
         found = refused(mirror.sentence) if mirror.is_mirrored else found
         clock.lap("mirror check")
+    if found.status == "failed" and params.yaw_hint_deg is not None:
+        found = replace(found, reason=f"{found.reason} {_only_near_hint(params)}")
     if fit is not None:
         status, reason = weigh(found.status, found.reason, found.T, fit, found.ruling)
         found = replace(found, status=status, reason=reason)
@@ -172,6 +174,13 @@ def _registered(
     if surveyed is not None:
         result = replace(result, checks=checks_document(surveyed, found.adjusted, found.T))
     return result if fit is None else with_pairs(result, fit)
+
+
+def _only_near_hint(params: Register) -> str:
+    return (
+        f"Only turns within {params.plan.yaw_hint_range_deg:g} deg of the yaw hint, "
+        f"{params.yaw_hint_deg:g}, were searched: check it, or register without it."
+    )
 
 
 class _Tried(NamedTuple):

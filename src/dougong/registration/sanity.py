@@ -111,9 +111,9 @@ def propose_scale(source: Cloud, target: Cloud) -> ScaleProposal | None:
     larger = "target" if ratio > 1.0 else "source"
     shown = float(f"{size:.3g}")
     sentence = (
-        f"the {larger} is about {shown:,g} times as large as the other cloud, as if it were in "
-        f"{UNIT_RATIOS[unit]}; expected the same unit. Scale it by 1/{unit:g} (or fix its "
-        "units) and register again."
+        f"the {larger} is about {shown:,g} times as large as the other cloud (roughly, by their "
+        f"extents), as if it were in {UNIT_RATIOS[unit]}; expected the same unit. Export it in the "
+        f"other one's, 1/{unit:g} of these numbers, and register again."
     )
     return ScaleProposal(factor=unit if ratio > 1.0 else 1.0 / unit, ratio=ratio, sentence=sentence)
 

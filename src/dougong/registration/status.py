@@ -54,8 +54,8 @@ def _refusal(ruling: Ruling, fine: FineResult | None, params: Verdict) -> str | 
             f"the best pose explains {100 * ruling.explained:.0f} % of the structure near the "
             f"other cloud, {ruling.sharpness:.1f} times what a pose half a metre beside it does "
             f"(at least {100 * params.least_explained:.0f} % and {params.least_sharpness:g} times "
-            "expected). Are these two clouds of the same place, in the same unit, and do they "
-            "overlap?"
+            "expected). Are these two clouds of the same place, in the same unit, with z up, and "
+            "do they overlap?"
         )
     if overlap < params.least_overlap:
         return (

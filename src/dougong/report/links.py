@@ -147,7 +147,7 @@ def _facts(document: Mapping[str, Any]) -> list[tuple[str, str]]:
         ]
     spread = _spread(document["covariance"], document.get("covariance_about"))
     if spread:
-        facts.append(("standard deviation of the fit", spread))
+        facts.append(("standard deviation of the fit, widened where few blocks tell it", spread))
     return facts
 
 
