@@ -212,9 +212,11 @@ def test_thinning_keeps_original_points_whatever_their_order():
     assert len(cells) == len(kept)
 
 
-def test_blocks_cover_all_points_by_place():
-    points = np.array([[0.1, 0.1, 0.1], [4.9, 4.9, 4.9], [5.1, 0.1, 0.1], [-0.1, 0.0, 0.0]])
-    block, count = covariance.blocks_of(points, 5.0)
+@pytest.mark.parametrize("shift", [0.0, 0.37, 4e6])
+def test_blocks_cover_all_points_by_place_wherever_the_origin_is(shift):
+    """In plan the first block begins a quarter of an edge before the points."""
+    points = np.array([[0.0, 0.0, 0.0], [3.7, 3.7, 4.9], [3.8, 0.1, 0.1], [9.0, 0.0, 0.0]])
+    block, count = covariance.blocks_of(points + shift, 5.0)
     assert count == 3
     assert block[0] == block[1] != block[2] != block[3]
 
