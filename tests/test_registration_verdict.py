@@ -112,6 +112,15 @@ def test_a_lone_symmetric_house_is_ambiguous_though_one_start_was_given():
     assert "yaw hint" in found.reason
 
 
+def test_a_hint_between_two_equal_poses_is_not_advised_again():
+    found = decide(
+        site(2, *SYMMETRIC), site(3, *SYMMETRIC), starts(turned(0.5)), Register(yaw_hint_deg=90.0)
+    )
+    assert found.status == "ambiguous"
+    assert "the hint says 90" in found.reason
+    assert "A yaw hint" not in found.reason
+
+
 def test_a_yaw_hint_decides_a_symmetric_house():
     found = decide(
         site(2, *SYMMETRIC), site(3, *SYMMETRIC), starts(turned(0.5)), Register(yaw_hint_deg=0.0)

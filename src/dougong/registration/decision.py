@@ -193,7 +193,7 @@ def _doubted(
         if hand == "unknown":
             reason += " Its mirror image fits as well: what both clouds show is symmetric."
         clock.lap("mirror check")
-    if status == "ok" and not is_near_hint(heard.T, params):
+    if status != "failed" and not is_near_hint(heard.T, params):
         status, reason = "ambiguous", _off_hint(heard.T, params)
     return status, reason, evidence
 
