@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dougong._words import counted
 from dougong.cloud import Cloud, Frame
 from dougong.errors import FormatError
 from dougong.formats.describe import describe
@@ -22,7 +23,6 @@ from dougong.formats.faults import (
     SAMPLE,
     coordinate_hashes,
     copies_among,
-    counted,
     unit_suspicion,
     wide_box,
 )

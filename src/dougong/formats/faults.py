@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong._boxes import are_within
+from dougong._words import counted
 from dougong.cloud import Cloud, Frame
 from dougong.typing import Points
 
@@ -168,11 +169,6 @@ def _coarseness(frame: Frame) -> str | None:
         f"its coordinates are stored in steps of {coarsest:.3g} m: too coarse for a building. "
         "Export it with steps of 0.001 m or finer."
     )
-
-
-def counted(points: int) -> str:
-    """Return a number of points in words."""
-    return "1 point" if points == 1 else f"{points:,} points"
 
 
 def points_beyond(xyz: Points, low: Any, high: Any) -> int:

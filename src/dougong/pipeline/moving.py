@@ -111,10 +111,15 @@ def _doubts(input: Path, scans: int, known: Known) -> list[str]:
     FrameError
         As `transform_file`.
     """
-    _refuse_target(input, known)
+    digest = sha256(input) if known.inputs else ""
+    _refuse_target(input, digest, known)
     crs, unit_m = system_in(input)
     _require_unit(input, crs, unit_m, known)
-    notes = [*known.notes, *_file_notes(input, known), *_system_notes(input, crs, unit_m, known)]
+    notes = [
+        *known.notes,
+        *_file_notes(input, digest, known),
+        *_system_notes(input, crs, unit_m, known),
+    ]
     if known.target_crs is not None and is_same_crs(crs, known.target_crs):
         notes.append(
             f"{input.name} is in {known.target}'s coordinate system already; check that it is "
@@ -132,8 +137,8 @@ def _doubts(input: Path, scans: int, known: Known) -> list[str]:
     return notes
 
 
-def _refuse_target(input: Path, known: Known) -> None:
-    """Refuse the file onto which another one was registered.
+def _refuse_target(input: Path, digest: str, known: Known) -> None:
+    """Refuse the file, of this SHA-256, onto which another one was registered.
 
     Raises
     ------
@@ -141,8 +146,7 @@ def _refuse_target(input: Path, known: Known) -> None:
         It is that.
     """
     registered = {stem_of(Path(str(one.get("path")))): one.get("sha256") for one in known.inputs}
-    digest = registered.get(known.target)
-    if digest is None or digest == registered.get(known.source) or sha256(input) != digest:
+    if registered.get(known.target) != digest or registered.get(known.source) == digest:
         return
     msg = (
         f"{input.name} is {known.target}, onto which {known.source} was registered: it stays, and "
@@ -188,13 +192,13 @@ def _unit_name(unit_m: Unit) -> str:
     return plan if plan == height else f"{plan} with heights in {height}"
 
 
-def _file_notes(input: Path, known: Known) -> list[str]:
+def _file_notes(input: Path, digest: str, known: Known) -> list[str]:
     """Return what is to be said of a file that is called as a registered one, and is another."""
     # By the name alone: the path is as it was given then, and may be of another machine.
     digests = [
         one.get("sha256") for one in known.inputs if Path(str(one.get("path"))).name == input.name
     ]
-    if not digests or sha256(input) in digests:
+    if not digests or digest in digests:
         return []
     return [
         f"{input.name} is not the file that was registered under this name (its SHA-256 is "
