@@ -196,3 +196,56 @@ def test_the_given_system_reaches_registration_and_result(tmp_path, monkeypatch,
 
 
 SCAN = np.random.default_rng(7).uniform(0, 20, (3000, 3))
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz", ".copc.laz", ".ply"])
+@pytest.mark.parametrize(("unit", "metres"), [("mm", 0.001), ("in", 0.0254), ("ftUS", 1200 / 3937)])
+def test_a_unit_alone_is_a_system_of_local_coordinates(tmp_path, suffix, unit, metres):
+    numbers = np.random.default_rng(0).uniform(0, 20, (50, 3)) / metres
+    given = in_system(Cloud.from_points(numbers), unit)
+    np.testing.assert_allclose(given.xyz + given.frame.origin, numbers * metres, atol=1e-9)
+    dougong.write(given, tmp_path / f"a{suffix}")
+    again = dougong.read(tmp_path / f"a{suffix}")
+    assert again.frame.unit_m == pytest.approx((metres,) * 3, rel=1e-12)
+    by_x = [v[v[:, 0].argsort()] for v in (again.xyz + again.frame.origin, numbers * metres)]
+    np.testing.assert_allclose(*by_x, atol=1e-4)
+    assert is_same_crs(again.frame.crs, given.frame.crs)
+
+
+@pytest.mark.parametrize("is_tiled", [False, True])
+def test_filter_takes_millimetres_for_what_they_are(tmp_path, is_tiled, capsys, monkeypatch):
+    monkeypatch.setattr("dougong.pipeline.filtering.is_too_large", lambda *_: is_tiled)
+    points = site("photogrammetry")
+    for name, factor in (("m", 1.0), ("mm", 1000.0)):
+        dougong.write(Cloud.from_points(points * factor), tmp_path / f"{name}.ply")
+    told = {}
+    for name in ("m", "mm"):
+        asked = ["--kind", "photogrammetry", "--crs", name, "--json"]
+        assert call(["filter", f"{tmp_path}/{name}.ply", f"{tmp_path}/{name}.laz", *asked]) == 0
+        told[name] = json.loads(capsys.readouterr().out)
+    assert told["mm"]["points_kept"] == told["m"]["points_kept"] > 30_000
+    assert told["mm"]["ground_points"] == told["m"]["ground_points"] > 0
+    assert not any("millimetres" in note for note in told["mm"]["notes"])
+    cleaned = [dougong.read(tmp_path / f"{name}.laz") for name in ("m", "mm")]
+    by_x = [v[v[:, 0].argsort()] for v in (c.xyz + c.frame.origin for c in cleaned)]
+    np.testing.assert_allclose(*by_x, atol=2e-4)
+
+
+def test_local_coordinates_are_no_place_that_two_files_share(tmp_path, capsys):
+    points = site("photogrammetry")
+    dougong.write(Cloud.from_points(points * 1000.0), tmp_path / "a.ply")
+    dougong.write(Cloud.from_points((points + [3.0, 1.0, 0.5]) * 1000.0), tmp_path / "b.ply")
+    ends = [f"{tmp_path}/a.ply", f"{tmp_path}/b.ply", "--out", f"{tmp_path}/out"]
+    units = ["--source-crs", "mm", "--target-crs", "mm", "--filtered", "--json"]
+    assert call(["register", *ends, "--coarse", "none", *units]) in (0, 3)
+    matrix = np.array(json.loads(capsys.readouterr().out)["matrix"])
+    np.testing.assert_allclose(matrix[:3, 3], [3000.0, 1000.0, 500.0], atol=5.0)
+    found = ["--matrix", f"{tmp_path}/out/registration.json", "--accept-best", "--json"]
+    assert call(["transform", f"{tmp_path}/a.ply", f"{tmp_path}/moved.ply", *found]) == 0
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert not any("moved twice" in note for note in notes)
+
+
+def test_an_unknown_unit_is_told_the_known_ones():
+    with pytest.raises(InputError, match=r"'furlong'.*mm, cm, m, in, ft or ftUS"):
+        in_system(Cloud.from_points(PLACE[None]), "furlong")

@@ -142,6 +142,7 @@ def filter_file(
     only: str | None,
     mark: bool,
     settings: Sequence[str],
+    crs: str | None = None,
     overwrite: bool,
     work: str | None = None,
     memory_bytes: int | None,
@@ -155,7 +156,7 @@ def filter_file(
     return filtering.filter_file(
         input,
         output,
-        job=filtering.filter_job(kind, only, settings),
+        job=filtering.filter_job(kind, only, settings, crs),
         mark=mark,
         overwrite=overwrite,
         memory_bytes=memory_bytes,

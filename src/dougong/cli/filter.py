@@ -20,6 +20,7 @@ def command(
     only: str | None = None,
     mark: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     settings: Annotated[list[str] | None, Parameter(name="--set", negative="")] = None,
+    crs: str | None = None,
     overwrite: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     common: Common = DEFAULT,
 ) -> int:
@@ -47,6 +48,9 @@ def command(
         old class in classification_in.
     settings
         NAME.FIELD=VALUE, for example curvature_weighted.rule=paper; may be given several times.
+    crs
+        Coordinate system of an INPUT that names none, such as EPSG:32650; mm for local coordinates
+        in millimetres.
     overwrite
         Replace an output that exists already.
     """
@@ -59,6 +63,7 @@ def command(
             only=only,
             mark=mark,
             settings=settings or (),
+            crs=crs,
             overwrite=overwrite,
             work=common.work,
             memory_bytes=common.memory_bytes(),

@@ -82,7 +82,8 @@ def command(
         Refuse a pose under which neither cloud has this share of itself within reach of the
         other; 0.2 where it is not given.
     source_crs
-        Coordinate system of a SOURCE that names none, such as EPSG:32650.
+        Coordinate system of a SOURCE that names none, such as EPSG:32650; mm for local coordinates
+        in millimetres.
     target_crs
         The same for TARGET.
     accept_best

@@ -292,7 +292,7 @@ def _shape(low: Values, high: Values, cell: float) -> tuple[int, int]:
             f"the cloth would have {float(rows) * float(columns):.3g} particles for "
             f"{width:.0f} x {depth:.0f} m at {cell:g} m; at most {MAX_PARTICLES:.3g} are possible. "
             f"Set cloth_resolution_m to {advised * 1.01:.2g} or more, or crop the cloud; "
-            "coordinates in millimetres must be scaled to metres."
+            "name the unit of coordinates in millimetres (--crs mm)."
         )
         raise InputError(msg)
     return int(rows), int(columns)

@@ -103,7 +103,8 @@ def unit_suspicion(sample: Points, frame: Frame) -> str | None:
     if span[2] >= _HIGH_M:
         return (
             f"it would be {span[2]:,.0f} m high: its coordinates may be millimetres. "
-            "Scale them to metres (by 0.001 where they are)."
+            "Where they are, name their unit: crs = 'mm' in a project, --crs mm of filter, "
+            "--source-crs mm or --target-crs mm of register."
         )
     return None
 

@@ -10,6 +10,20 @@ from dougong.cloud import Cloud
 from dougong.errors import FrameError, InputError
 
 METRES = (1.0, 1.0, 1.0)
+LOCAL_UNITS = {
+    "mm": ("millimetre", 0.001),
+    "cm": ("centimetre", 0.01),
+    "m": ("metre", 1.0),
+    "in": ("inch", 0.0254),
+    "ft": ("foot", 0.3048),
+    "ftUS": ("US survey foot", 1200 / 3937),
+}
+"""Units that stand for a system of their own: local coordinates in that unit, z up."""
+_LOCAL = "local coordinates in"
+KNOWN_SYSTEMS = (
+    "an EPSG code such as EPSG:32650, WKT, or the unit of local coordinates: "
+    f"{', '.join(list(LOCAL_UNITS)[:-1])} or {list(LOCAL_UNITS)[-1]}"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,6 +40,8 @@ class Units:
     """Earth-centred: metres, but z does not point up."""
     is_projected: bool = False
     """A map: easting and northing, lengths in plan scaled by the projection."""
+    is_local: bool = False
+    """Only a unit is known: the same text for two files does not mean the same place."""
     has_vertical: bool = False
     """The system itself says what z is measured in."""
 
@@ -44,16 +60,27 @@ def parse_crs(text: str) -> Any:
 
 @lru_cache(maxsize=64)
 def as_wkt(text: str) -> str | None:
-    """Return `text` (WKT of any version, "EPSG:n") as WKT 2, None where it is not understood.
+    """Return `text` (WKT of any version, "EPSG:n", "mm") as WKT 2, None where not understood.
+
+    A unit of `LOCAL_UNITS` alone is local coordinates in that unit.
 
     A system that names its own EPSG code, and is what that code stands for, is written as the
     EPSG database words it: the same system then is the same text, whichever file it came from.
     """
-    crs = parse_crs(text)
+    unit = text.strip()
+    crs = parse_crs(_local_system(*LOCAL_UNITS[unit]) if unit in LOCAL_UNITS else text)
     if crs is None:
         return None
     registered = _registered(crs)
     return str((crs if registered is None else registered).to_wkt())
+
+
+def _local_system(unit: str, metres: float) -> str:
+    return (
+        f'ENGCRS["{_LOCAL} {unit}",EDATUM["local"],CS[Cartesian,3],'
+        'AXIS["x",unspecified],AXIS["y",unspecified],AXIS["z",up],'
+        f'LENGTHUNIT["{unit}",{metres!r}]]'
+    )
 
 
 def _codes(crs: Any) -> tuple[int, ...] | None:
@@ -170,6 +197,7 @@ def units_of(wkt: str | None) -> Units:
         is_geographic=is_geographic,
         is_geocentric=bool(crs.is_geocentric),
         is_projected=bool(crs.is_projected),
+        is_local=str(crs.name).startswith(_LOCAL),
         has_vertical=has_vertical,
     )
 
@@ -278,7 +306,8 @@ def in_system(cloud: Cloud, crs: str | None) -> Cloud:
         Of a file that names no system; its numbers then are in the units of `crs`, or in metres
         where its format has no other.
     crs : str or None
-        WKT, or a code such as "EPSG:32650" (compound: "EPSG:32650+5773").
+        WKT, a code such as "EPSG:32650" (compound: "EPSG:32650+5773"), or the unit of local
+        coordinates (`LOCAL_UNITS`).
 
     Raises
     ------
@@ -292,8 +321,8 @@ def in_system(cloud: Cloud, crs: str | None) -> Cloud:
     wkt = as_wkt(crs)
     if wkt is None:
         msg = (
-            f"the coordinate system {crs!r} of {cloud.name} is not understood; give an EPSG code "
-            "such as EPSG:32650, or WKT."
+            f"the coordinate system {crs!r} of {cloud.name} is not understood; give "
+            f"{KNOWN_SYSTEMS}."
         )
         raise InputError(msg)
     if has_metric_format(cloud) and units_of(wkt).unit_m != METRES:

@@ -16,6 +16,7 @@ from dougong.filters.selection import Reason
 from dougong.formats import (
     describe,
     faults_of,
+    in_system,
     read,
     write,
 )
@@ -75,6 +76,8 @@ class FilterJob:
     kind: Kind | None
     only: str | None
     params: Parameters
+    crs: str | None = None
+    """The coordinate system of a file that names none."""
 
     def run(self, cloud: Cloud, progress: Progress) -> Filtered:
         """Filter `cloud`."""
@@ -93,7 +96,9 @@ class FilterJob:
         return tiled_job(steps_of(self.kind, recipe))
 
 
-def filter_job(kind: Kind | None, only: str | None, settings: Sequence[str]) -> FilterJob:
+def filter_job(
+    kind: Kind | None, only: str | None, settings: Sequence[str], crs: str | None = None
+) -> FilterJob:
     """Return what ``dougong filter`` was asked for.
 
     Raises
@@ -104,7 +109,8 @@ def filter_job(kind: Kind | None, only: str | None, settings: Sequence[str]) -> 
     if only is not None:
         name = filter_name(only)
         values = parse_overrides(settings, {name: single_fields(name)})
-        return FilterJob(kind=kind, only=name, params=single_parameters(name, values.get(name, {})))
+        params = single_parameters(name, values.get(name, {}))
+        return FilterJob(kind=kind, only=name, params=params, crs=crs)
     if kind is None:
         msg = (
             "--kind is missing: say which sensor made the cloud, --kind lidar or "
@@ -117,7 +123,7 @@ def filter_job(kind: Kind | None, only: str | None, settings: Sequence[str]) -> 
         name: updated(getattr(recipe, name), values, name)
         for name, values in parse_overrides(settings, fields).items()
     }
-    return FilterJob(kind=kind, only=None, params=recipe.model_copy(update=changes))
+    return FilterJob(kind=kind, only=None, params=recipe.model_copy(update=changes), crs=crs)
 
 
 def _filters_of(recipe: Parameters) -> list[str]:
@@ -154,7 +160,7 @@ def filter_file(
         digest, stamp = identified(input)
     room = Room.of(memory_bytes)
     on_tiles = is_too_large(input, room, 0)
-    facts = f"{digest} {job.tiled().grid!r}"
+    facts = f"{digest} in {job.crs} {job.tiled().grid!r}"
     with _places(output, work, facts, is_alone=on_tiles) as places:
         result: Cloud | Pieces
         if on_tiles:
@@ -230,9 +236,10 @@ def _pieces(cloud: Pieces, job: FilterJob, books: Books, mark: bool) -> Pieces:
     return pieces
 
 
-def _decoded(input: Path, stamp: Stamp) -> Iterator[Cloud]:
+def _decoded(input: Path, stamp: Stamp, crs: str | None) -> Iterator[Cloud]:
     """Yield the chunks of a file, all its scans as one cloud, if it stays as it is meanwhile."""
-    yield from decoded(input)
+    for chunk in decoded(input):
+        yield in_system(chunk, crs)
     require_unchanged(input, stamp)
 
 
@@ -269,7 +276,7 @@ def _filtered_whole(
 ) -> tuple[Books, Cloud]:
     """Return what was decided about every point of the file, and what is written of it."""
     with clock.measure("read"):
-        cloud = read(input)
+        cloud = in_system(read(input), job.crs)
         require_unchanged(input, stamp)
         noticed = (*cloud.notes, *faults_of(cloud))
     with clock.measure("filter"):
@@ -282,7 +289,7 @@ def _filtered_on_tiles(
 ) -> tuple[Books, Pieces]:
     """Return what was decided about every point of the file, and its points once more."""
     books, spool = filter_chunks(
-        _decoded(input, stamp),
+        _decoded(input, stamp, job.crs),
         job.tiled(),
         points=describe(input).points,
         room=room,
@@ -291,7 +298,7 @@ def _filtered_on_tiles(
         scratch=places.scratch,
         progress=progress,
     )
-    return books, partial(_decoded, input, stamp) if spool is None else spool.pieces
+    return books, partial(_decoded, input, stamp, job.crs) if spool is None else spool.pieces
 
 
 def reason_table(tally: Tally) -> dict[str, dict[str, Any]]:

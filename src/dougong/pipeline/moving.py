@@ -120,7 +120,8 @@ def _doubts(input: Path, scans: int, known: Known) -> list[str]:
         *_file_notes(input, digest, known),
         *_system_notes(input, crs, unit_m, known),
     ]
-    if known.target_crs is not None and is_same_crs(crs, known.target_crs):
+    is_place = known.target_crs is not None and not units_of(known.target_crs).is_local
+    if is_place and is_same_crs(crs, known.target_crs):
         notes.append(
             f"{input.name} is in {known.target}'s coordinate system already; check that it is "
             "not moved twice"

@@ -11,7 +11,7 @@ from dougong.errors import InputError
 from dougong.formats import SUFFIXES, scans_in
 from dougong.formats.registry import kind_of
 from dougong.formats.stream import stem_of
-from dougong.formats.units import as_wkt
+from dougong.formats.units import KNOWN_SYSTEMS, as_wkt
 from dougong.params import Parameters
 from dougong.pipeline.merging import Merge
 from dougong.pipeline.recipes import Recipe
@@ -45,7 +45,8 @@ class Entry(Parameters):
     files: Annotated[tuple[str, ...], Field(min_length=1)]
     """Paths or patterns, relative to the project file."""
     crs: str | None = None
-    """Coordinate system of files that name none: "EPSG:32650", compound "EPSG:32650+5773", WKT."""
+    """Coordinate system of files that name none: "EPSG:32650", compound "EPSG:32650+5773", WKT; or
+    the unit of local coordinates, such as "mm"."""
     registered: bool = True
     """False: each station (E57) or file moves by itself."""
     scale_known: bool = True
@@ -55,9 +56,7 @@ class Entry(Parameters):
     @classmethod
     def _is_a_system(cls, crs: str | None) -> str | None:
         if crs is not None and as_wkt(crs) is None:
-            msg = (
-                f"{crs!r} is no coordinate system; expected an EPSG code such as EPSG:32650, or WKT"
-            )
+            msg = f"{crs!r} is no coordinate system; expected {KNOWN_SYSTEMS}"
             raise ValueError(msg)
         return crs
 

@@ -113,7 +113,7 @@ def propose_scale(source: Cloud, target: Cloud) -> ScaleProposal | None:
     sentence = (
         f"the {larger} is about {shown:,g} times as large as the other cloud (roughly, by their "
         f"extents), as if it were in {UNIT_RATIOS[unit]}; expected the same unit. Export it in the "
-        f"other one's, 1/{unit:g} of these numbers, and register again."
+        f"other one's, 1/{unit:g} of these numbers, or name its unit (crs), and register again."
     )
     return ScaleProposal(factor=unit if ratio > 1.0 else 1.0 / unit, ratio=ratio, sentence=sentence)
 
