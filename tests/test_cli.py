@@ -685,3 +685,18 @@ def test_help_breaks_lines_where_the_terminal_ends_and_nowhere_else():
         "other",
         "    Short.",
     ]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("filter", "`dougong filter` needs INPUT, which is missing; see `dougong filter --help`."),
+        ("register a.las", "`dougong register` needs TARGET, which is missing"),
+        ("run", "`dougong run` needs --out, which is missing"),
+        ("report", "`dougong report` needs FOLDER, which is missing"),
+        ("filter a.las b.las --kind", "--kind is given without a value"),
+    ],
+)
+def test_what_a_command_line_lacks_is_named_as_its_help_names_it(line, said, capsys):
+    assert call(line.split()) == 2
+    assert said in capsys.readouterr().err

@@ -438,6 +438,28 @@ def test_points_that_a_las_header_does_not_count_are_said(tmp_path, point_format
     assert "its writer may have been stopped" in check(path)[0].text
 
 
+@pytest.mark.parametrize(("suffix", "said"), [(".laz", "20,001"), (".copc.laz", "90,000")])
+def test_points_that_a_laz_header_does_not_count_are_said(tmp_path, suffix, said):
+    """Chunks of one size are told by their number alone: the last may hold one point."""
+    path = tmp_path / f"a{suffix}"
+    points = np.random.default_rng(0).uniform(0, 9, (120_000, 3))
+    write(Cloud.from_points(points), path)
+    assert not [note for note in read(path).notes if "wrongly" in note]
+    raw = bytearray(path.read_bytes())
+    counted = 80_000 if suffix == ".laz" else 30_000
+    struct.pack_into("<Q", raw, 247, counted)
+    path.write_bytes(raw)
+    (note,) = [note for note in read(path).notes if "wrongly" in note]
+    assert f"declares {counted:,} points, wrongly: its chunks hold at least {said} more" in note
+    assert {note} == {n for c in iterate(path, 20_000) for n in c.notes if "wrongly" in n}
+    assert note in describe(path).notes
+    assert [f.severity for f in check(path) if "chunks hold" in f.text] == ["warning"]
+    struct.pack_into("<Q", raw, 247, 0)
+    path.write_bytes(raw)
+    with pytest.raises(FormatError, match="no points by its header, but its chunks hold at least"):
+        read(path)
+
+
 @pytest.mark.parametrize(
     ("offset", "value", "words"),
     [

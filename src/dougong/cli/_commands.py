@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Sequence
 
-from cyclopts import App, CycloptsError, UnusedCliTokensError
+from cyclopts import App, CycloptsError, MissingArgumentError, UnusedCliTokensError
 
 import dougong
 from dougong.cli import (
@@ -96,14 +96,27 @@ def call(tokens: Sequence[str]) -> int:
             print_error=False,
             result_action="return_value",
         )
-    except UnusedCliTokensError as error:
+    except CycloptsError as error:
+        said = InputError(_told(error, tokens))
+        return fail(said, as_json="--json" in tokens, debug=False)
+    return int(code or 0)
+
+
+def _told(error: CycloptsError, tokens: Sequence[str]) -> str:
+    """Return what is wrong with a command line, and what to do, in one sentence."""
+    if isinstance(error, UnusedCliTokensError):
         unused = error.unused_tokens or [""]
         more = f" and {len(unused) - 1} more" if len(unused) > 1 else ""
-        msg = (
+        return (
             f"{unused[0]!r}{more}: more than this command takes. Quote a name with blanks, and see "
             f"`dougong {tokens[0]} --help`."
         )
-        return fail(InputError(msg), as_json="--json" in tokens, debug=False)
-    except CycloptsError as error:
-        return fail(InputError(str(error)), as_json="--json" in tokens, debug=False)
-    return int(code or 0)
+    if isinstance(error, MissingArgumentError) and error.argument is not None:
+        command = " ".join(("dougong", *(error.command_chain or ())))
+        argument = error.argument
+        if error.keyword is not None:
+            return f"{error.keyword} is given without a value; see `{command} --help`."
+        is_placed = argument.field_info.is_positional
+        name = argument.name.lstrip("-").upper() if is_placed else argument.name
+        return f"`{command}` needs {name}, which is missing; see `{command} --help`."
+    return str(error)

@@ -11,7 +11,14 @@ from dougong.cloud import Cloud, Frame, Records
 from dougong.errors import FormatError
 from dougong.formats.geotiff import read_geokeys
 from dougong.formats.las_header import PROJECTION, LasHeader, bits_of, read_header
-from dougong.formats.laz import Undecodable, damaged, decode, open_decoder, readable_points
+from dougong.formats.laz import (
+    Undecodable,
+    damaged,
+    decode,
+    open_decoder,
+    packed_points,
+    readable_points,
+)
 from dougong.formats.model import FileInfo, Triple, as_triple
 from dougong.formats.stream import opened, refuse_empty, stem_of, unit_notes
 from dougong.formats.units import as_wkt, units_of
@@ -146,8 +153,9 @@ def _too_large(path: Path, header: LasHeader) -> FormatError:
     )
 
 
-def _cloud(records: Records, header: LasHeader, frame: Frame, path: Path) -> Cloud:
-    notes = _notes(header, frame, path)
+def _cloud(
+    records: Records, header: LasHeader, frame: Frame, path: Path, notes: tuple[str, ...]
+) -> Cloud:
     if header.is_compressed and has_mixed_channels(records):
         warning = (
             "the waveform fields of its several scanner channels may be unpacked wrongly; "
@@ -165,23 +173,29 @@ def _cloud(records: Records, header: LasHeader, frame: Frame, path: Path) -> Clo
     )
 
 
-def _uncounted(header: LasHeader, path: Path) -> int:
-    """Return the bytes behind the points that the header counts, where others would lie."""
+def _surplus(header: LasHeader, path: Path) -> str | None:
+    """Return in words what lies behind the points that the header counts, None where nothing."""
+    if header.is_compressed:
+        left = packed_points(path, header) - header.count
+        return f"its chunks hold at least {left:,} more" if left > 0 else None
     ends = [path.stat().st_size]
     if header.evlr_place[1]:
         ends.append(header.evlr_place[0])
     if header.waveforms_start:
         ends.append(header.waveforms_start)
-    return min(ends) - header.points_start - header.count * header.point_bytes
+    left = min(ends) - header.points_start - header.count * header.point_bytes
+    if left < header.point_bytes:
+        return None
+    return f"{left:,} bytes (of {header.point_bytes} a point) follow behind them"
 
 
 def _refuse_empty(header: LasHeader, path: Path) -> None:
     """Raise FormatError where the header counts no points, and say what is there all the same."""
-    left = _uncounted(header, path)
-    if header.count == 0 and left >= header.point_bytes and not header.is_compressed:
+    surplus = None if header.count else _surplus(header, path)
+    if surplus is not None:
         msg = (
-            f"{path.name} holds no points by its header, but {left:,} bytes where they would be "
-            f"({header.point_bytes} a point): its writer may have been stopped. Export it again."
+            f"{path.name} holds no points by its header, but {surplus}: its writer may have been "
+            "stopped. Export it again."
         )
         raise FormatError(msg)
     refuse_empty(header.count, path)
@@ -201,11 +215,11 @@ def _notes(header: LasHeader, frame: Frame, path: Path) -> tuple[str, ...]:
             f"its header states no usable box (x {x:g} to {x_high:g}, y {y:g} to {y_high:g}, z "
             f"{z:g} to {z_high:g}), wrongly; the points themselves count."
         )
-    left = 0 if header.is_compressed else _uncounted(header, path)
-    if header.count and left >= header.point_bytes:
+    surplus = _surplus(header, path) if header.count else None
+    if surplus is not None:
         found.append(
-            f"its header declares {header.count:,} points, wrongly: {left:,} bytes (of "
-            f"{header.point_bytes} a point) follow behind them, and are not read. Export it again."
+            f"its header declares {header.count:,} points, wrongly: {surplus}, and are not read. "
+            "Export it again."
         )
     return tuple(found)
 
@@ -214,7 +228,8 @@ def read(path: Path) -> Cloud:
     """Return the whole file. Memory: the records and 24 bytes per point."""
     with _points(path) as (header, take):
         _refuse_empty(header, path)
-        return _cloud(take(header.count), header, frame_of(header), path)
+        frame = frame_of(header)
+        return _cloud(take(header.count), header, frame, path, _notes(header, frame, path))
 
 
 def iterate(path: Path, chunk_points: int) -> Iterator[Cloud]:
@@ -222,8 +237,10 @@ def iterate(path: Path, chunk_points: int) -> Iterator[Cloud]:
     with _points(path) as (header, take):
         _refuse_empty(header, path)
         frame = frame_of(header)
+        notes = _notes(header, frame, path)
         for start in range(0, header.count, chunk_points):
-            yield _cloud(take(min(chunk_points, header.count - start)), header, frame, path)
+            records = take(min(chunk_points, header.count - start))
+            yield _cloud(records, header, frame, path, notes)
 
 
 def describe(path: Path) -> FileInfo:

@@ -142,6 +142,26 @@ def _sequential(file: IO[bytes], header: LasHeader, laszip: bytes) -> Any:
         return None
 
 
+def packed_points(path: Path, header: LasHeader) -> int:
+    """Return how many points the chunk table holds at least; 0 where there is no table.
+
+    Chunks of one size are told by their number alone, so the last may hold a single point.
+    """
+    import lazrs
+
+    laszip = lazrs.LazVlr(_laszip_of(header, path))
+    try:
+        with path.open("rb") as file, _lazrs_errors():
+            file.seek(header.points_start)
+            table = lazrs.read_chunk_table(file, laszip)
+    except Undecodable:
+        return 0
+    counts = [points for points, _ in table]
+    if counts and not laszip.uses_variable_size_chunks():
+        counts[-1] = 1
+    return sum(counts)
+
+
 def readable_points(path: Path, header: LasHeader) -> int:
     """Return about how many points can be unpacked before a LAZ file breaks."""
     with path.open("rb") as file:
