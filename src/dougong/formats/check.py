@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dougong._words import counted
+from dougong._words import counted, of_all
 from dougong.cloud import Cloud, Frame
 from dougong.errors import FormatError
 from dougong.formats.describe import describe
@@ -197,7 +197,7 @@ def _of_points(path: Path, info: FileInfo, tally: _Tally) -> list[Finding]:
         found.append(Finding("error", text))
     elif copies:
         text = (
-            f"{path.name}: {copies:,} of {tally.rows:,} points lie exactly on another one. "
+            f"{path.name}: {of_all(copies, tally.rows, 'lies', 'lie')} exactly on another one. "
             "The voxel grid keeps one of each."
         )
         found.append(Finding("warning", text))
@@ -212,8 +212,8 @@ def _of_points(path: Path, info: FileInfo, tally: _Tally) -> list[Finding]:
     is_inside_origin = bool(((-origin >= low) & (-origin <= high)).all())
     if tally.at_origin and (tally.at_origin > 1 or not is_inside_origin):
         text = (
-            f"{path.name}: {tally.at_origin:,} points are exactly at 0, 0, 0, as scanners write "
-            "missing returns. Drop them."
+            f"{path.name}: {counted(tally.at_origin)} exactly at 0, 0, 0, as scanners write "
+            "missing returns. Drop what is there."
         )
         found.append(Finding("warning", text))
     return found + _far_points(path, info, tally, low, high)
@@ -228,7 +228,7 @@ def _far_points(path: Path, info: FileInfo, tally: _Tally, low: Any, high: Any) 
         count += int((beyond > 0).sum())
         farthest = max(farthest, float(beyond.max()))
     text = (
-        f"{path.name}: {count:,} of {info.points:,} points lie far from all others, up to "
+        f"{path.name}: {of_all(count, info.points, 'lies', 'lie')} far from all others, up to "
         f"{farthest:,.0f} m. Filters drop most of them; crop them before other use."
     )
     return [Finding("warning", text)]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dougong._boxes import are_within
-from dougong._words import counted
+from dougong._words import counted, of_all
 from dougong.cloud import Cloud, Frame
 from dougong.typing import Points
 
@@ -147,23 +147,25 @@ def faults_in_words(
     if 0 < copies == points - 1:
         found.append(f"all {points:,} points lie at one place.")
     elif copies:
-        found.append(f"{copies:,} of {points:,} points lie exactly on another one.")
+        found.append(f"{of_all(copies, points, 'lies', 'lie')} exactly on another one.")
     if far:
-        found.append(f"{far:,} of {points:,} points lie far from all others.")
+        found.append(f"{of_all(far, points, 'lies', 'lie')} far from all others.")
     if points < FEW:
         return (*found, f"only {counted(points)}: too few to filter or register.")
-    said = unit_suspicion(sample, frame) or _coarseness(frame)
+    said = unit_suspicion(sample, frame) or _coarseness(frame, sample)
     return (*found, said) if said else tuple(found)
 
 
-def _coarseness(frame: Frame) -> str | None:
+def _coarseness(frame: Frame, sample: Points) -> str | None:
     """Return in words that coordinates lie on too coarse a lattice, or None.
 
+    An axis along which nothing varies has no detail to lose.
     A step of just `COARSE_M`, as many programs choose unasked, is left to `check`.
     """
     if frame.step is None:
         return None
-    coarsest = max(step * unit for step, unit in zip(frame.step, frame.unit_m, strict=True))
+    steps = np.multiply(frame.step, frame.unit_m)
+    coarsest = float(steps.max(initial=0.0, where=np.ptp(sample, axis=0) > 0))
     if coarsest <= COARSE_M * (1 + 1e-9):
         return None
     return (
