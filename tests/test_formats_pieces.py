@@ -88,6 +88,22 @@ def test_pieces_are_merged_as_the_whole(cloud, tmp_path):
     assert one.points == two.points
 
 
+def test_pieces_are_finished_as_they_are_written_and_only_then(cloud, tmp_path):
+    finished = []
+
+    def finish(piece):
+        finished.append(len(piece))
+        return piece.with_attribute("far", np.asarray(piece.xyz[:, 0] * 2, dtype="f4"))
+
+    before = write_merged([finish(cloud)], tmp_path / "a.copc.laz", source_ids=[1])
+    finished.clear()
+    asked = {"source_ids": [1], "finish": [finish]}
+    after = write_merged([pieces_of(cloud, 700)], tmp_path / "b.copc.laz", **asked)
+    assert (tmp_path / "a.copc.laz").read_bytes() == (tmp_path / "b.copc.laz").read_bytes()
+    assert before.notes == after.notes
+    assert sum(finished) == len(cloud) + 1  # the form is told by one point
+
+
 def test_the_form_knows_where_the_points_lie(cloud, tmp_path):
     form = las_form(pieces_of(cloud, 700))
     written = read(write(cloud, tmp_path / "b.las").path)

@@ -330,7 +330,7 @@ def test_who_does_not_see_the_tiles_is_told_where_to_put_them(tmp_path):
 
 
 def test_no_more_tiles_are_begun_once_the_disk_is_full(tmp_path, monkeypatch):
-    cloud, _ = tiled(site(2), tmp_path, 1500)
+    cloud, _ = tiled(site(2), tmp_path, 200)
     tries = []
 
     def full(job):
@@ -340,4 +340,4 @@ def test_no_more_tiles_are_begun_once_the_disk_is_full(tmp_path, monkeypatch):
     monkeypatch.setattr(work, "judge_radius", full)
     with local_engine() as engine, pytest.raises(OutputError, match="full"):
         TileBench(cloud, engine).apply("radius", Radius())
-    assert len(tries) == 1
+    assert len(cloud.tiles) > engine.width == len(tries)  # those that were begun at once

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +18,9 @@ from dougong.formats.las_records import Whole, las_parts, set_integers
 from dougong.typing import Points
 
 _WEEK_S = 7 * 86_400.0
+
+Finish = Callable[[Cloud], Cloud]
+"""Gives a piece attributes that LAS has no field for; nothing else of it changes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,6 +38,8 @@ class LasForm:
     modern: bool
     packed: bool
     whole: Whole
+    finish: Finish | None
+    """What a piece goes through as it is written, and only then: it may be dear."""
     last_time: float | None
     """Latest GPS time in seconds; None: there is none, or all are 0."""
 
@@ -53,6 +59,7 @@ class LasForm:
 
     def records(self, piece: Cloud) -> Records:
         """Return the records of one piece."""
+        piece = piece if self.finish is None else self.finish(piece)
         return las_parts(piece, modern=self.modern, packed=self.packed, whole=self.whole)[1]
 
 
@@ -109,13 +116,17 @@ def _keeps_integers(piece: Cloud) -> bool:
     return isinstance(piece.header, LasHeader) and not piece.is_moved
 
 
-def las_form(pieces: Pieces, *, modern: bool = False, packed: bool = False) -> LasForm:
+def las_form(
+    pieces: Pieces, *, modern: bool = False, packed: bool = False, finish: Finish | None = None
+) -> LasForm:
     """Pass over a cloud once and return how each piece of it becomes LAS records.
 
     Parameters
     ----------
     modern, packed : bool
         As `las_parts`.
+    finish : callable, optional
+        Of the pieces, as they will be written.
 
     Raises
     ------
@@ -131,6 +142,8 @@ def las_form(pieces: Pieces, *, modern: bool = False, packed: bool = False) -> L
         survey.add(piece)
     if sample is None:
         raise InputError("a cloud in pieces needs at least one piece, got none.")
+    if finish is not None:
+        sample = finish(sample)
     is_empty = not survey.points
     is_kept = _keeps_integers(sample)
     whole = Whole(
@@ -158,5 +171,6 @@ def las_form(pieces: Pieces, *, modern: bool = False, packed: bool = False) -> L
         modern=modern,
         packed=packed,
         whole=whole,
+        finish=finish,
         last_time=survey.last_time,
     )

@@ -14,7 +14,7 @@ from dougong.cloud import Cloud, Frame, Pieces, Records, in_pieces
 from dougong.errors import FrameError, InputError, OutputError
 from dougong.formats.atomic import refuse_bad_target
 from dougong.formats.las_header import POINT_FORMATS, LasHeader, Vlr, new_header
-from dougong.formats.las_pieces import LasForm, las_form
+from dougong.formats.las_pieces import Finish, LasForm, las_form
 from dougong.formats.las_records import (
     describe_extras,
     descriptions_of,
@@ -37,6 +37,7 @@ def write_merged(
     source_ids: Sequence[int],
     overwrite: bool = False,
     hold: Hold | None = None,
+    finish: Sequence[Finish | None] | None = None,
 ) -> Written:
     """Write clouds that share a reference system as one file of point format 6, 7 or 8.
 
@@ -52,6 +53,8 @@ def write_merged(
         One per cloud, 0..65535; `source_id` is uint8 where all are below 256, else uint16.
     hold : Hold, optional
         What COPC may hold, and where the rest goes meanwhile.
+    finish : sequence of callable or None, optional
+        One per cloud: gives a piece attributes that LAS has no field for, as it is written.
 
     Raises
     ------
@@ -76,8 +79,10 @@ def write_merged(
     _refuse_mixed_frames(firsts)
     parts = [
         _Part(pieces, form, ident, first.frame)
-        for pieces, first, ident in zip(sources, firsts, source_ids, strict=True)
-        if (form := las_form(pieces, modern=True)).points
+        for pieces, first, ident, last in zip(
+            sources, firsts, source_ids, finish or [None] * len(clouds), strict=True
+        )
+        if (form := las_form(pieces, modern=True, finish=last)).points
     ]
     if not parts:
         raise OutputError(f"no cloud has a point left, so {path.name} was not written.")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dougong.cloud import Cloud, Frame, Pieces
+from dougong.cloud import Cloud, Frame
 from dougong.filters import neighbourhood
 from dougong.formats import write
 from dougong.formats.units import parse_crs
@@ -170,10 +170,6 @@ class Painter:
             distance[found] = one.distance_m[observed][place[found]]
             lod[found] = one.signed.lod95_m[observed][place[found]]
         return with_own(with_own(cloud, DISTANCE, distance), LOD, lod)
-
-    def pieces(self, pieces: Pieces) -> Pieces:
-        """Return a cloud that comes in pieces with its distances."""
-        return lambda: (self.painted(piece) for piece in pieces())
 
 
 def distances_document(measured: Measured, file: str) -> dict[str, Any]:

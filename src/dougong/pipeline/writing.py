@@ -40,7 +40,7 @@ def write_clouds(
     """
     notes: list[str] = []
     parts: list[Part] = []
-    painted: list[Pieces] = []
+    painters: list[Painter | None] = []
     measured = [link.measured for link in linked if link.measured is not None]
     for source_id, link in enumerate(linked, 1):
         progress.stage(f"writing clouds/{link.mover.name}.laz")
@@ -68,20 +68,20 @@ def write_clouds(
                     kind=link.mover.kind,
                 )
             )
-            painted.append(pieces if paint is None else paint.pieces(pieces))
-    return _write_merged(parts, painted, merge, out, progress, clock, hold), notes
+            painters.append(paint)
+    return _write_merged(parts, painters, merge, out, progress, clock, hold), notes
 
 
 def _write_merged(
     parts: Sequence[Part],
-    painted: Sequence[Pieces],
+    painters: Sequence[Painter | None],
     merge: Merge,
     out: Path,
     progress: Progress,
     clock: Clock,
     hold: Hold,
 ) -> dict[str, Any]:
-    """Write the merged cloud of `parts`, as they are `painted`; return what it holds."""
+    """Write the merged cloud of `parts`, painted with their distances; return what it holds."""
     progress.stage("choosing what is merged")
     with clock.measure("merge"):
         chosen = choose(parts, merge, hold)
@@ -89,12 +89,13 @@ def _write_merged(
     with clock.measure("write"):
         written = write_merged(
             [
-                _left(pieces, remaining)
-                for pieces, remaining in zip(painted, chosen.remaining, strict=True)
+                _left(part.pieces, remaining)
+                for part, remaining in zip(parts, chosen.remaining, strict=True)
             ],
             out / MERGED,
             source_ids=[part.source_id for part in parts],
             hold=hold,
+            finish=[None if paint is None else paint.painted for paint in painters],
         )
     document = _merged_document(parts, chosen, progress)
     return {"file": MERGED, **document, "notes": list(written.notes)}

@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from dougong.errors import DougongError, InputError, OutputError, TileError
+from dougong.threads import get_threads
 from dougong.tiles.cloud import Arrays, Record, read_record, write_arrays
 from dougong.tiles.folder import Folder
 
@@ -143,6 +144,10 @@ def engine_in_use() -> Iterator[Engine]:
 
 @contextmanager
 def local_engine() -> Iterator[Engine]:
-    """Yield the embedded engine: one tile at a time, whose kernels use all threads."""
-    with ThreadPoolExecutor(1) as executor:
-        yield Engine(executor, 1)
+    """Yield the embedded engine: two tiles at a time, whose kernels share the threads.
+
+    What is serial about a tile (reading, halos, writing) goes on beside the other one's kernels.
+    """
+    width = min(2, get_threads())
+    with ThreadPoolExecutor(width) as executor:
+        yield Engine(executor, width)

@@ -4,7 +4,7 @@ A tile is a node of the voxels' own octree, so no voxel lies in two tiles and th
 those of the whole cloud.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from dougong.formats.faults import (
     sample_step,
     wide_box,
 )
+from dougong.threads import ahead
 from dougong.tiles.cloud import POINTS, Arrays, Tile, TiledCloud, name_of, tile_of, write_arrays
 from dougong.tiles.folder import Folder
 from dougong.tiles.grid import grid_for
@@ -59,16 +60,15 @@ def partition(
     kept = RowFile(spool.folder / "kept.rows", is_thinned=True)
     copies = points = 0
     grid = grid_for(root.low, root.edge_m, root.voxel_m, spool.points, most)
-    for part in spool.cut(grid, most):
-        rows = part.read()
-        part.remove()
-        copies += copies_in(rows.xyz)
+    for rows, same in ahead(_with_copies(spool.cut(grid, most))):
+        copies += same
         chosen = _chosen(rows, spool, params, root)
         kept.append(chosen)
         points += len(chosen.row)
     grid = grid_for(root.low, root.edge_m, root.voxel_m, points, most_kept)
     tiles = tuple(
-        _saved(part, folder, is_decimated=params is not None) for part in cut(kept, grid, most_kept)
+        _saved(name, rows, folder, is_decimated=params is not None)
+        for name, rows in ahead(_named(cut(kept, grid, most_kept)))
     )
     assert spool.first is not None
     faults = faults_in_words(
@@ -82,6 +82,20 @@ def partition(
     tiled = TiledCloud(folder, tiles, {**(told or {}), **facts})
     tiled.save()
     return tiled
+
+
+def _with_copies(parts: Iterator[RowFile]) -> Iterator[tuple[Rows, int]]:
+    """Yield what parts hold, and how many of its points lie exactly on another one."""
+    for _, rows in _named(parts):
+        yield rows, copies_in(rows.xyz)
+
+
+def _named(parts: Iterator[RowFile]) -> Iterator[tuple[str, Rows]]:
+    """Yield the names of parts and what they hold; their files are removed."""
+    for part in parts:
+        rows = part.read()
+        part.remove()
+        yield part.path.stem, rows
 
 
 def _sample_and_far(spool: Spool) -> tuple[Points, int]:
@@ -108,15 +122,13 @@ def _chosen(rows: Rows, spool: Spool, params: OctreeVoxelGrid | None, root: Root
     return rows._replace(stands_for=selection.attributes["voxel_count"]).take(selection.is_kept)
 
 
-def _saved(part: RowFile, folder: Folder, *, is_decimated: bool) -> Tile:
+def _saved(name: str, rows: Rows, folder: Folder, *, is_decimated: bool) -> Tile:
     """Write a tile in the order of the cloud, and return it."""
-    rows = part.read()
     rows = rows.take(np.argsort(rows.row))
-    tile = tile_of(part.path.stem, rows.xyz)
+    tile = tile_of(name, rows.xyz)
     arrays: Arrays = {"xyz": rows.xyz, "row": rows.row}
     if is_decimated:
         assert rows.stands_for is not None
         arrays["voxel_count"] = rows.stands_for
     write_arrays(folder, name_of(tile, POINTS), arrays, {})
-    part.remove()
     return tile
