@@ -299,7 +299,7 @@ def test_control_points_of_another_height_are_said_to_contradict_the_clouds():
     raised[2, 3] += 3.0
     found = register_site(polygon(4, 9.0) * [1.0, 0.6], points(raised))
     assert found.status != "ok"
-    assert "contradict the hint or the control points" in found.reason
+    assert "the clouds contradict the control points: a pose elsewhere" in found.reason
 
 
 def long_wall(seed, noise):

@@ -81,6 +81,7 @@ def hear_pair(
         lambda T: is_near_hint(T, params) and (control is None or control.allows(T)),
     )
     ruling = told_by_control(court, levels, ruling, control, quick, params.verdict)
+    ruling = _with_contradicted(ruling, params, control)
     ruling = told_apart(court, clouds, levels, ruling, quick, params.verdict)
     clock.lap("proof")
     fine, adjusted = _refined(*clouds, ruling, params, control)
@@ -177,6 +178,18 @@ def _judged(
         return "ambiguous", why, spread
     agree = f"The parts of the shared surface agree about it to {1e3 * spread:.0f} mm (95 %)."
     return status, f"{reason} {agree}", spread
+
+
+def _with_contradicted(ruling: Ruling, params: Register, control: Control | None) -> Ruling:
+    """Return the ruling with what was given, and the clouds contradict, in words."""
+    if ruling.overruled is None:
+        return ruling
+    T, names = ruling.overruled.T, []
+    if not is_near_hint(T, params):
+        names.append("the yaw hint")
+    if control is not None and (control.refutes(T) or not control.allows(T)):
+        names.append("the control points")
+    return replace(ruling, contradicted=" and ".join(names))
 
 
 def is_near_hint(T: Transform, params: Register) -> bool:

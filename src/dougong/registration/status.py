@@ -16,7 +16,7 @@ def status_of(ruling: Ruling, fine: FineResult | None, params: Verdict) -> tuple
     if ruling.overruled is not None:
         # Where they say, no pose need hold: that is no word against the clouds.
         return "ambiguous" if refusal is None else "failed", (
-            f"the clouds contradict the hint or the control points: a pose elsewhere explains "
+            f"the clouds contradict {ruling.contradicted}: a pose elsewhere explains "
             f"{100 * ruling.overruled.gain:.1f} % more of the surface (p = "
             f"{max(ruling.overruled.p_value, 1e-9):.1g}). Check them, or register without them."
         )

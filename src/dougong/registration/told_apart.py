@@ -69,7 +69,13 @@ def told_apart(
     if alone.sharpness < _SHARPER * params.least_sharpness:
         return ruling
     said = f"{len(refuted)} other poses fit the walls as well, and {told.said}"
-    return replace(alone, beaten=(*alone.beaten, *refuted), told=said, overruled=ruling.overruled)
+    return replace(
+        alone,
+        beaten=(*alone.beaten, *refuted),
+        told=said,
+        overruled=ruling.overruled,
+        contradicted=ruling.contradicted,
+    )
 
 
 def told_by_control(

@@ -117,6 +117,8 @@ class Ruling:
     overruled: Comparison | None = None
     """How the winner compares with a pose that is not allowed (by a hint, by control points) and
     that the clouds prefer beyond doubt; None: there is none."""
+    contradicted: str = ""
+    """What was given that leaves the pose of `overruled` out, in words."""
     told: str = ""
     """What told the winner from poses that fit as well; see `told_apart`."""
 
