@@ -274,3 +274,34 @@ def test_few_blocks_widen_the_expected_displacement_by_students_t():
     slides[3, 3] = 0.01**2 * 1.7
     found = covariance.displacement95(slides, np.zeros(3), np.zeros((1, 3)), 16, 1.7)
     assert found == pytest.approx(0.0213, rel=0.06)
+
+
+def ground_and_house(rng, per_m2):
+    """Return points and normals of 44 x 44 m of ground and a house on it: few surfaces face x."""
+    quads = [
+        ((-22, -22, 0), (44, 0, 0), (0, 44, 0)),
+        *(((-9, y, 0), (18, 0, 0), (0, 0, 6)) for y in (-4, 4)),
+        *(((x, -4, 0), (0, 8, 0), (0, 0, 6)) for x in (-9, 9)),
+    ]
+    points, normals = [], []
+    for corner, u, v in (np.array(quad, dtype=float) for quad in quads):
+        across = np.cross(u, v)
+        area = float(np.linalg.norm(across))
+        at = rng.random((int(area * per_m2), 2))
+        points.append(corner + at[:, :1] * u + at[:, 1:] * v)
+        normals.append(np.broadcast_to(across / area, (len(at), 3)))
+    xyz = np.concatenate(points)
+    return xyz + rng.normal(0.0, 0.002, xyz.shape), np.concatenate(normals)
+
+
+@pytest.mark.parametrize("shift", [(0.3, 0.0), (-0.3, 0.2), (0.0, 0.35), (0.06, -0.04)])
+def test_few_surfaces_that_face_a_way_are_not_outliers_to_the_many(shift):
+    # By one robust sigma for all, that of the ground, walls more than 12 mm off had no weight.
+    rng = np.random.default_rng(5)
+    source, target = (
+        prepared(*ground_and_house(rng, per_m2), spacing=0.3) for per_m2 in (12.0, 30.0)
+    )
+    off = np.eye(4)
+    off[:2, 3] = shift
+    found = refine(source, target, off)
+    assert np.abs(found.T_target_source[:2, 3]).max() < 0.002

@@ -42,6 +42,9 @@ from dougong.typing import Index, Transform, Values
 _LEAST_PAIRS = 60
 _NO_COMMON_UP_DEG = 10.0
 _MOST_SEARCHED = 300_000
+_SECTORS = 6
+"""Of half a turn: walls that face within 15 degrees of each other are one kind of surface."""
+_UPWARD = 0.7
 
 
 class Icp(Parameters):
@@ -176,9 +179,10 @@ def _climbed(
         T = levelled(T, levels[-1].target.xyz.mean(axis=0))
     stopped = "not started"
     for number, level in enumerate(levels):
-        tolerance = params.tolerance_m * (1.0 if number == len(levels) - 1 else 20.0)
-        T, stopped = _run_level(level, T, params, number, tolerance, history)
-    return T, stopped
+        T, stopped = _run_level(level, T, params, number, 20.0 * params.tolerance_m, history)
+    # Every kind of surface lies on the other cloud now: the exact fit is by the sharpest of all.
+    last = len(levels) - 1
+    return _run_level(levels[-1], T, params, last, params.tolerance_m, history, by_facing=False)
 
 
 def _run_level(
@@ -188,6 +192,8 @@ def _run_level(
     number: int,
     tolerance_m: float,
     history: list[Mapping[str, float]] | None,
+    *,
+    by_facing: bool = True,
 ) -> tuple[Transform, str]:
     cosine = float(np.cos(np.radians(params.normal_angle_deg)))
     for _ in range(params.max_iterations):
@@ -196,7 +202,7 @@ def _run_level(
         )
         if len(pairs.residuals) < _LEAST_PAIRS:
             return T, f"fewer than {_LEAST_PAIRS} correspondences within {level.bound_m:.3g} m"
-        weights, scale = _weights(pairs, level, params)
+        weights, scale = _weights(pairs, level, params, by_facing=by_facing)
         centre, length = centre_and_length(pairs, weights)
         step = _step(pairs, weights, T, centre, length, scale, level, params)
         T = moved_by(T, step, centre)
@@ -223,14 +229,40 @@ def _distance(pairs: Pairs, params: Icp) -> Values:
     return lengths
 
 
-def _weights(pairs: Pairs, level: Level, params: Icp) -> tuple[Values, float]:
-    """Return weight per pair and the robust sigma of the residuals, metres."""
+def _weights(
+    pairs: Pairs, level: Level, params: Icp, *, by_facing: bool = False
+) -> tuple[Values, float]:
+    """Return weight per pair and the robust sigma of the residuals, metres.
+
+    With `by_facing` surfaces that face another way have a sigma of their own.
+    """
     distance = np.abs(_distance(pairs, params))
-    scale = 1.4826 * weighted_median(distance, pairs.weights)
     # Never stricter than the sensors: what bends by a noise's width stays in.
     floor = max(float(np.hypot(level.source.sigma_m, level.target.sigma_m)), 1e-3 * level.bound_m)
-    scale = max(scale, floor)
+    scale = max(1.4826 * weighted_median(distance, pairs.weights), floor)
+    if by_facing and params.method == "point-to-plane":
+        distance = distance * (scale / _scale_by_facing(pairs, distance, scale))
     return pairs.weights * robust_weights(distance, scale, params.robust), scale
+
+
+def _scale_by_facing(pairs: Pairs, distance: Values, scale: float) -> Values:
+    """Return the robust sigma (n,) of each pair: that of the surface that faces as it does.
+
+    Ground and most walls may lie on each other to millimetres while the few surfaces that hold one
+    direction are decimetres off: by one sigma for all they would be outliers, and stay so.
+    """
+    up = np.abs(pairs.normals[:, 2])
+    turn = np.arctan2(pairs.normals[:, 1], pairs.normals[:, 0])
+    sector = np.floor((turn / np.pi % 1.0) * _SECTORS + 0.5).astype(np.int64) % _SECTORS
+    facing = np.where(up > _UPWARD, _SECTORS, sector)
+    own = np.full(len(distance), scale)
+    for one in range(_SECTORS + 1):
+        is_one = facing == one
+        if int(is_one.sum()) >= _LEAST_PAIRS:
+            own[is_one] = max(
+                scale, 1.4826 * weighted_median(distance[is_one], pairs.weights[is_one])
+            )
+    return own
 
 
 def centre_and_length(pairs: Pairs, weights: Values) -> tuple[NDArray[np.float64], float]:
