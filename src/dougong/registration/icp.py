@@ -177,9 +177,8 @@ def _climbed(
     T = as_transform(T_initial, "T_initial")
     if params.dof == 4:
         T = levelled(T, levels[-1].target.xyz.mean(axis=0))
-    stopped = "not started"
     for number, level in enumerate(levels):
-        T, stopped = _run_level(level, T, params, number, 20.0 * params.tolerance_m, history)
+        T, _ = _run_level(level, T, params, number, 20.0 * params.tolerance_m, history)
     # Every kind of surface lies on the other cloud now: the exact fit is by the sharpest of all.
     last = len(levels) - 1
     return _run_level(levels[-1], T, params, last, params.tolerance_m, history, by_facing=False)
