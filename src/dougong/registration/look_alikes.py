@@ -25,18 +25,18 @@ from dougong.registration.evidence import (
 from dougong.registration.ground_relief import level_ground, relief
 from dougong.registration.prepare import Prepared
 from dougong.registration.rivals import is_near
+from dougong.registration.shown_sides import (
+    are_beside,
+    are_walls,
+    has_ground_on_one_side,
+    lacks_opposite_sides,
+)
 from dougong.registration.standing_things import Things, things_of
 from dougong.registration.symmetry import in_short, move_between
 from dougong.registration.verdict import Ruling, Verdict
-from dougong.typing import Mask, Points, Transform
+from dougong.typing import Kind, Mask, Points, Transform
 
 _DECIDES = "Control points, a yaw hint, or a cloud that shows more of the site would decide."
-_BEARINGS, _FEW = 36, 0.002
-_BEARING_DEG = 360.0 / _BEARINGS
-_HIDDEN_DEG = 100.0
-"""No ground in so wide an arc: 150 to 210 degrees before corners and fronts, all round 0 to 20."""
-_UPRIGHT = 0.5
-"""The rise of a normal up to which it is a wall's."""
 _SUPPORT, _SHARPNESS, _VIOLATION = 0.5, 0.4, 0.01
 """A beaten pose is possible where it explains this share of what lies near under it, this share as
 sharply as the winner, and violates this much more free space at most. Of ten cloisters the false
@@ -88,10 +88,9 @@ def look_alike_doubt(
         return None
     # The ruling may be of parts of both clouds.
     best = hear(court, winner)
-    # A flight shows a building from all sides.
-    is_scanned = source.kind == target.kind == "lidar"
-    if is_scanned and not telling.is_vouched:
-        unseen = _unseen_copy(court, grounds, ruling, best, rivals)
+    if not telling.is_vouched:
+        kinds = source.kind, target.kind
+        unseen = _unseen_copy(court, grounds, kinds, ruling, best, rivals)
         if unseen is not None:
             return unseen
     return _rests_on_one_part(court, ruling, best, rivals, things, params)
@@ -128,11 +127,12 @@ def _rests_on_one_part(
 def _unseen_copy(
     court: Court,
     grounds: tuple[Points, Points],
+    kinds: tuple[Kind, Kind],
     ruling: Ruling,
     winner: Testimony,
     rivals: Sequence[Transform],
 ) -> str | None:
-    """Return where two scans that nothing else ties to one place leave room for a copy of it."""
+    """Return where clouds that nothing else ties to one place leave room for a copy of it."""
     if court.source.free is not None and court.target.free is not None:
         for rival in rivals:
             if _is_possible(court, hear(court, rival), ruling):
@@ -143,36 +143,30 @@ def _unseen_copy(
                 )
     is_explained = np.split(winner.is_explained, [len(court.source.points)])
     if all(
-        _shows_one_side(ground, witness, explained)
-        for ground, witness, explained in zip(
-            grounds, (court.source, court.target), is_explained, strict=True
-        )
+        _shows_one_side(*shown)
+        for shown in zip(grounds, kinds, (court.source, court.target), is_explained, strict=True)
     ):
         return (
-            "both scans show one side of what stands there, and neither the ground nor anything "
+            "both clouds show one side of what stands there, and neither the ground nor anything "
             "about it tells that it is the same side: an opposite side that is alike would fit as "
             f"well. {_DECIDES}"
         )
     return None
 
 
-def _shows_one_side(ground: Points, witness: Witness, is_explained: Mask) -> bool:
-    """Say whether ground (n, 3) is shown on one side only of the explained walls.
-
-    What stands there hides the ground behind it from a scan of a corner or of a front. Stations all
-    round, or within a room or a court, show ground in every bearing from the middle of the walls.
-    """
-    is_wall = witness.is_structure & is_explained & (np.abs(witness.normals[:, 2]) < _UPRIGHT)
-    walls = witness.points[is_wall, :2]
-    if not len(walls) or not len(ground):
+def _shows_one_side(ground: Points, kind: Kind, witness: Witness, is_explained: Mask) -> bool:
+    """Say whether a cloud shows one of two opposite sides only of the explained walls."""
+    is_wall = are_walls(witness)
+    if not (is_wall & is_explained).any():
         return False
-    low, high = np.quantile(walls, [0.02, 0.98], axis=0)
-    off = ground[:, :2] - (low + high) / 2.0
-    bearing = np.degrees(np.arctan2(off[:, 1], off[:, 0])) % 360.0
-    held = np.bincount((bearing / _BEARING_DEG).astype(np.int64) % _BEARINGS)
-    shown = np.flatnonzero(held > _FEW * len(ground))
-    empty = np.diff([*shown, shown[0] + _BEARINGS]) - 1
-    return bool(empty.max() * _BEARING_DEG >= _HIDDEN_DEG)
+    explained = witness.points[is_wall & is_explained]
+    if kind == "lidar":
+        return has_ground_on_one_side(ground, explained)
+    # A flight may show sides that the other cloud does not: then it is tied to the place by them.
+    is_wall &= are_beside(witness.points, explained)
+    return lacks_opposite_sides(
+        ground, witness.points[is_wall], witness.normals[is_wall], witness.weights[is_wall]
+    )
 
 
 def _moved(rival: Transform, ruling: Ruling) -> str:
