@@ -13,6 +13,7 @@ from dougong.registration.deciding_part import deciding_part
 from dougong.registration.evidence import hear, summon
 from dougong.registration.ground_relief import relief
 from dougong.registration.prepare import prepare
+from dougong.registration.shown_sides import lacks_opposite_sides
 from dougong.registration.standing_things import Telling, things_of
 from dougong.registration.verdict import Verdict
 
@@ -230,7 +231,9 @@ def test_a_place_is_made_again_by_its_seed(kind):
 @pytest.mark.parametrize(
     ("kind", "seed", "things", "said"),
     [
-        ("corners", 2, 0, "both scans show one side"),
+        ("corners", 2, 0, "both clouds show one side"),
+        ("flights", 1, 0, "both clouds show one side"),
+        ("flights", 1, 8, "are gone under it and found under another one"),
         ("cloister", 0, 3, "the place repeats"),
         # Posts of the scaffolding stand about and are found: they moved with it.
         ("scaffold", 2, 0, "alone tells which way round"),
@@ -247,10 +250,11 @@ def test_a_copy_that_fits_best_is_not_ok(kind, seed, things, said):
     assert not pose_errors(found.matrix, trial.truth).is_correct
 
 
-def test_the_same_part_among_things_is_ok():
-    trial = make_trial("cloister", 1, is_copy=False, things=12)
+@pytest.mark.parametrize(("kind", "things"), [("cloister", 12), ("flights", 8)])
+def test_the_same_part_among_things_is_ok(kind, things):
+    trial = make_trial(kind, 1, is_copy=False, things=things)
     source, target = (Cloud.from_points(points) for points in (trial.source, trial.target))
-    found = register(source, target, source_kind="lidar", target_kind="lidar")
+    found = register(source, target, source_kind=trial.source_kind, target_kind=trial.target_kind)
     assert found.status == "ok"
     assert pose_errors(found.matrix, trial.truth).is_correct
 
@@ -342,3 +346,45 @@ def test_things_that_stand_apart_tell_the_turns_of_a_hall(spots, status):
         )
         assert off.max() < 0.05
         assert "what stands about tells them apart" in found.reason
+
+
+def walls_and_ground(shown, size=(14.0, 8.0), eaves=0.0):
+    """Walls of a house of which the sides in `shown` were seen, and the ground before these."""
+    rng = np.random.default_rng(3)
+    x, y = np.array(size) / 2
+    sides = {"n": (0, 1, x, y), "s": (0, -1, x, y), "e": (1, 0, y, x), "w": (-1, 0, y, x)}
+    walls, normals, ground = [], [], []
+    for name in shown:
+        nx, ny, along, off = sides[name]
+        t, z = rng.uniform(-along, along, 60 * int(along)), rng.uniform(0.2, 5, 60 * int(along))
+        walls.append(np.column_stack([nx * off + ny * t, ny * off + nx * t, z]))
+        # Eaves hang over the ground; normals of clouds have either sign.
+        walls[-1][z > 4.5, :2] += eaves * np.array([nx, ny])
+        sign = rng.choice([-1.0, 1.0], (len(t), 1))
+        normals.append(sign * np.array([nx, ny, 0.0]))
+        u, v = rng.uniform(-along, along, 4000), off + rng.uniform(0.0, 10.0, 4000)
+        ground.append(np.column_stack([nx * v + ny * u, ny * v + nx * u, 0 * u]))
+    return [np.concatenate(parts) for parts in (ground, walls, normals)]
+
+
+@pytest.mark.parametrize("turn", [0.0, 33.0, 85.0])
+@pytest.mark.parametrize("eaves", [0.0, 1.2])
+@pytest.mark.parametrize(
+    ("shown", "lacks"),
+    [("nesw", False), ("n", True), ("ne", True), ("nwe", True), ("ns", False)],
+)
+def test_walls_tell_whether_opposite_sides_are_shown(shown, lacks, eaves, turn):
+    ground, walls, normals = walls_and_ground(shown, eaves=eaves)
+    R = turned(turn)[:3, :3].T
+    found = lacks_opposite_sides(ground @ R, walls @ R, normals @ R, np.ones(len(walls)))
+    assert found is lacks
+
+
+def test_a_free_standing_wall_and_a_place_without_ground_show_no_lack():
+    ground, walls, normals = walls_and_ground("n")
+    both = np.vstack([ground, ground * [1, -1, 1] + [0, 8, 0]])
+    weights = np.ones(len(walls))
+    assert lacks_opposite_sides(ground, walls, normals, weights)
+    assert not lacks_opposite_sides(both, walls, normals, weights)
+    assert not lacks_opposite_sides(ground[:0], walls, normals, weights)
+    assert not lacks_opposite_sides(ground, walls[:0], normals[:0], weights[:0])

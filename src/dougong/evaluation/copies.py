@@ -29,6 +29,8 @@ from dougong.typing import Points
 Spots = NDArray[np.float64]
 """(k, 2) in plan."""
 _EYE_M = 1.65
+_BEFORE = 0.7
+"""Cosine of the bearing, from what is built, up to which a camera is before a station."""
 _APART_M = 0.6
 """Clear space between things, and between them and what is built."""
 
@@ -42,6 +44,8 @@ class Surveys:
     """(k, 3) each."""
     is_flown: bool = False
     """The second survey is a flight: its stations only say what it looks at."""
+    is_flown_before: bool = False
+    """Both are flights, before what their stations see: neither goes round."""
     is_one_place: bool = True
     """False: the worlds are two places, and no motion is true."""
 
@@ -73,7 +77,9 @@ def make_trial(
     clouds = []
     for k, (world, stations) in enumerate(zip(seen.worlds, seen.stations, strict=True)):
         tracer = Tracer(world)
-        if k == 1 and seen.is_flown:
+        if seen.is_flown_before:
+            clouds.append(_flown(tracer, world, photogrammetry_points, rng, before=stations))
+        elif k == 1 and seen.is_flown:
             clouds.append(_flown(tracer, world, photogrammetry_points, rng))
         else:
             params = scanner.Scanner(points=lidar_points)
@@ -92,16 +98,29 @@ def make_trial(
         source=source,
         target=clouds[1].xyz,
         truth=truth if seen.is_one_place else None,
-        target_kind="photogrammetry" if seen.is_flown else "lidar",
+        source_kind="photogrammetry" if seen.is_flown_before else "lidar",
+        target_kind="photogrammetry" if seen.is_flown or seen.is_flown_before else "lidar",
     )
 
 
-def _flown(tracer: Tracer, world: Mesh, points: int, rng: np.random.Generator) -> scanner.Returns:
+def _flown(
+    tracer: Tracer,
+    world: Mesh,
+    points: int,
+    rng: np.random.Generator,
+    before: Points | None = None,
+) -> scanner.Returns:
+    """Fly round what is built, or only `before` it: where stations (k, 3) stand."""
     built = world.vertices[world.faces[world.labels != GROUND]].reshape(-1, 3)
     low, high = built.min(axis=0), built.max(axis=0)
     radius = float(np.ptp(built[:, :2], axis=0).max()) / 2.0
     centre = np.array([*(low + high)[:2] / 2.0, 0.0])
     cameras = drone.flight(tracer, centre, radius, float(high[2]), rng)
+    if before is not None:
+        way = (before[:, :2] - centre[:2]).mean(axis=0)
+        off = cameras.places[:, :2] - centre[:2]
+        cosine = off @ way / (np.linalg.norm(off, axis=1) * np.linalg.norm(way))
+        cameras = cameras.taken((cosine > _BEFORE) & (off @ way > radius * np.linalg.norm(way)))
     return drone.photograph(tracer, cameras, drone.Drone(points=points), rng)
 
 
@@ -116,6 +135,17 @@ def _corners(rng: np.random.Generator, is_copy: bool, things: int) -> Surveys:
     about = _things(rng, things, 6.0 + half.max(), [half], np.vstack([one, two]))
     world = join([house, _ground(60.0), about])
     return Surveys(worlds=(world, world), stations=(_eyes(one[:count]), _eyes(two[:count])))
+
+
+def _flights(rng: np.random.Generator, is_copy: bool, things: int) -> Surveys:
+    """Fly before one corner of a house that equals itself turned by 180 degrees."""
+    half, house = _house(rng)
+    off = rng.uniform(4.0, 8.0, (2, 2))
+    one, two = half + off[:1], half + off[1:]
+    two = -two if is_copy else two
+    about = _things(rng, things, 6.0 + half.max(), [half], np.zeros((0, 2)))
+    world = join([house, _ground(60.0), about])
+    return Surveys(worlds=(world, world), stations=(_eyes(one), _eyes(two)), is_flown_before=True)
 
 
 def _cloister(rng: np.random.Generator, is_copy: bool, things: int) -> Surveys:
@@ -233,6 +263,7 @@ def _with_moved(
 
 COPIES: dict[str, Builder] = {
     "corners": _corners,
+    "flights": _flights,
     "cloister": _cloister,
     "rooms": _rooms,
     "twins": _twins,

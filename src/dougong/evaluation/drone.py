@@ -43,6 +43,11 @@ class Cameras:
     partners: NDArray[np.int64]
     """(k, 4) the cameras each one is matched with."""
 
+    def taken(self, are_taken: Mask) -> Cameras:
+        """Return those cameras that `are_taken` (k,), five at least, matched among themselves."""
+        places = self.places[are_taken]
+        return Cameras(places=places, axes=self.axes[are_taken], partners=_partners(places))
+
 
 def flight(
     tracer: Tracer, centre: Points, radius: float, top: float, rng: np.random.Generator
@@ -76,9 +81,14 @@ def flight(
     right[is_oblique] = np.cross(forward[is_oblique], (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     axes = np.stack([right, np.cross(right, forward), forward], axis=1)
-    apart = np.linalg.norm(at[:, None] - at[None], axis=2)
+    return Cameras(places=at, axes=axes, partners=_partners(at))
+
+
+def _partners(places: Points) -> NDArray[np.int64]:
+    apart = np.linalg.norm(places[:, None] - places[None], axis=2)
     np.fill_diagonal(apart, np.inf)
-    return Cameras(places=at, axes=axes, partners=np.argsort(apart, axis=1, kind="stable")[:, :4])
+    nearest: NDArray[np.int64] = np.argsort(apart, axis=1, kind="stable")[:, :4]
+    return nearest
 
 
 def photograph(
