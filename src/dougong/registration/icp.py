@@ -45,6 +45,7 @@ _MOST_SEARCHED = 300_000
 _SECTORS = 6
 """Of half a turn: walls that face within 15 degrees of each other are one kind of surface."""
 _UPWARD = 0.7
+"""The rise of a normal from which on it is no wall's."""
 
 
 class Icp(Parameters):
@@ -245,22 +246,21 @@ def _weights(
 
 
 def _scale_by_facing(pairs: Pairs, distance: Values, scale: float) -> Values:
-    """Return the robust sigma (n,) of each pair: that of the surface that faces as it does.
+    """Return the robust sigma (n,) of each pair: that of the walls that face as it does.
 
-    Ground and most walls may lie on each other to millimetres while the few surfaces that hold one
-    direction are decimetres off: by one sigma for all they would be outliers, and stay so.
+    Ground and most walls may lie on each other to millimetres while the few walls that hold one
+    direction are decimetres off: by one sigma for all they would be outliers, and stay so. What
+    faces up has the one of all: roofs seen from either side are a thickness apart, and stay out.
     """
-    up = np.abs(pairs.normals[:, 2])
+    is_wall = np.abs(pairs.normals[:, 2]) <= _UPWARD
     turn = np.arctan2(pairs.normals[:, 1], pairs.normals[:, 0])
     sector = np.floor((turn / np.pi % 1.0) * _SECTORS + 0.5).astype(np.int64) % _SECTORS
-    facing = np.where(up > _UPWARD, _SECTORS, sector)
     own = np.full(len(distance), scale)
-    for one in range(_SECTORS + 1):
-        is_one = facing == one
+    for one in range(_SECTORS):
+        is_one = is_wall & (sector == one)
         if int(is_one.sum()) >= _LEAST_PAIRS:
-            own[is_one] = max(
-                scale, 1.4826 * weighted_median(distance[is_one], pairs.weights[is_one])
-            )
+            of_one = weighted_median(distance[is_one], pairs.weights[is_one])
+            own[is_one] = max(scale, 1.4826 * of_one)
     return own
 
 
