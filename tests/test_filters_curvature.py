@@ -314,6 +314,31 @@ def test_protective_keeps_a_wall_of_any_density(density):
     assert np.median(chosen.attributes["spacing_m"]) == pytest.approx(density**-0.5, rel=0.1)
 
 
+@pytest.mark.parametrize("scatter", [0.6, 1.0, 2.0])
+def test_protective_keeps_a_wall_whose_points_scatter_as_far_as_they_are_apart(scatter):
+    """A handheld scanner's 10 mm at a spacing of 10 mm: one point in ten to fifteen went."""
+    points = wall(40_000, 3, 2.0)
+    points[:, 1] *= scatter * 0.01 / 0.002
+    rng = np.random.default_rng(1)
+    strays = rng.uniform([0, 0.2, 0], [2, 1.2, 2], (200, 3))
+    strays[::2, 1] *= -1.0
+    chosen = curvature_weighted(np.vstack([points, strays]), CurvatureWeighted())
+    assert chosen.is_kept[:40_000].mean() > 0.98
+    assert chosen.is_kept[40_000:].mean() < 0.05
+    assert any("scatter off their surfaces" in note for note in chosen.notes)
+    margin = chosen.attributes["removal_margin"]
+    np.testing.assert_array_equal(chosen.is_kept, margin <= 1.0)
+
+
+def test_protective_is_as_strict_as_ever_with_thin_surfaces_and_known_reach():
+    thin = curvature_weighted(wall(40_000, 3, 2.0), CurvatureWeighted())
+    assert not thin.notes
+    thick = wall(5000, 3, 1.0) * [1.0, 7.0, 1.0]
+    strict = curvature_weighted(thick, CurvatureWeighted(reach_m=0.5))
+    assert not strict.notes
+    assert strict.is_kept.mean() < 0.98
+
+
 def test_protective_keeps_a_figure_that_stands_alone():
     rng = np.random.default_rng(5)
     figure = rng.normal(size=(6000, 3))

@@ -147,11 +147,19 @@ SPARSE = np.random.default_rng(2).uniform([0, 0, 0], [60, 0.01, 60], (2500, 3))
 HEAPED = np.vstack([site(4, 800), np.zeros((2500, 3))])
 DENSE = np.random.default_rng(3).uniform([0, 0, 0], [0.3, 0.001, 0.3], (20_000, 3))
 
+THICK = np.vstack(
+    [
+        things(),
+        np.random.default_rng(4).normal([4, 0, 2.5], [2.0, 0.06, 1.2], (12_000, 3)),
+    ]
+)
+
 
 @pytest.mark.parametrize(
     ("points", "reach_m", "most"),
     [
         (things(), None, 150),
+        (THICK, None, 900),
         (things(), 0.2, 250),
         (SMALL_ALONE, None, 40),
         (SMALL_ALONE, 0.3, 40),
@@ -175,6 +183,7 @@ def test_things_across_tiles_are_judged_as_wholes(tmp_path, points, reach_m, mos
         np.testing.assert_array_equal(found[detail], wanted)
     np.testing.assert_array_equal(found["code"] == Reason.KEPT, expected.is_kept)
     assert of_filter(notes) == expected.notes
+    assert any("scatter off" in note for note in notes) == (points is THICK)
 
 
 def test_noise_stays_in_its_tiles(tmp_path):

@@ -311,7 +311,9 @@ def _protective(
 ) -> Selection:
     own = as_points(points)
     seen = own if beside is None else np.concatenate([own, as_points(beside)])
-    verdict = protective.judge(seen, p.tests, p.reach_m, low).of_first(len(own))
+    found = protective.judge(seen, p.tests, p.reach_m, low)
+    ease = protective.ease_of(lambda: (found.curvature,), len(seen), p.reach_m)
+    verdict = found.of_first(len(own))
     chosen = protective_choice(verdict.margin, verdict.reason, p, voxel_count)
     note = None
     if len(chosen.is_kept):
@@ -321,7 +323,7 @@ def _protective(
     return Selection(
         is_kept=chosen.is_kept,
         attributes={**chosen.attributes, **more},
-        notes=() if note is None else (note,),
+        notes=(*protective.ease_notes(ease), *(() if note is None else (note,))),
     )
 
 

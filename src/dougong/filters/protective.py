@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dougong._checks import as_points
-from dougong.filters.groups import GROUP, Sizes, pieces_joined, sizes_of
+from dougong.filters.groups import GROUP, MANY, Sizes, pieces_joined, sizes_of
 from dougong.filters.local_spacing import FAR_CELLS
 from dougong.filters.octree_voxel_grid import robust_low
+from dougong.filters.ranks import ValueBlocks, at_rank
 from dougong.filters.surroundings import (
     CHARGE,
     NEIGHBOURS,
@@ -42,6 +43,13 @@ ROW_NEIGHBOURS, ROW_WIDTH, ROW_ACCIDENTS = 24, 0.5, 1e-3
 either side) has so many that chance would make fewer than this number of such rows there."""
 ROW_REACH = 0.1
 """In rows the spacing counts as at most this many reaches."""
+
+THIN, THICK = 0.05, 0.10
+"""Surface variation that half of all points exceed: up to the first, surfaces are thin; from the
+other on the sensor scatters about as far as points are apart, and what it shows has a thickness."""
+THICK_EASE = 1.4
+"""In a thick cloud neighbours may be so many times as far: on the outside of Gaussian scatter they
+are, one point in ten went there, and it is surface. Groups are judged as ever."""
 
 
 class Verdict(NamedTuple):
@@ -114,6 +122,8 @@ def judge(
     index = build_index(points)
     low = robust_low(index.points) if low is None else low
     tested, reach = test_cloud(index, reach_m, tests, low)
+    ease = ease_of(lambda: (tested.curvature,), len(tested.margin), reach_m)
+    tested = tested._replace(margin=eased(tested.margin, tested.reason, ease))
     margin, reason = tested.margin, tested.reason
     if is_too_few(len(margin), reach_m):
         margin[:], reason[:] = 0.0, Taken.KEPT
@@ -139,6 +149,32 @@ def judge(
 def is_too_few(points: int, reach_m: float | None) -> bool:
     """Say whether so few points have no surroundings to be judged by: all stay."""
     return reach_m is None and points <= TESTS
+
+
+def ease_of(variation: ValueBlocks, points: int, reach_m: float | None) -> float:
+    """Return what margins in a whole cloud are divided by, by the surface variation of its points.
+
+    1 where the reach is given, since then the cloud may be a part, and with few points.
+    """
+    if reach_m is not None or points < MANY:
+        return 1.0
+    share = (at_rank(variation, points // 2) - THIN) / (THICK - THIN)
+    return 1.0 + (THICK_EASE - 1.0) * min(max(share, 0.0), 1.0)
+
+
+def eased(margin: Values, reason: NDArray[np.uint8], ease: float) -> Values:
+    """Return the margins (n,) of the tests as a thick cloud has them; alone is alone in any."""
+    as_thick: Values = np.where(reason == Taken.ALONE, margin, margin / ease)
+    return as_thick
+
+
+def ease_notes(ease: float) -> tuple[str, ...]:
+    """Return what is to be said of a thick cloud."""
+    note = (
+        "the points scatter off their surfaces about as far as they are apart: neighbours may be "
+        f"{ease:.2f} times as far as usual, and more noise near surfaces stays"
+    )
+    return (note,) if ease > 1.0 else ()
 
 
 def doubtful_of(tested: Tested, are_large: Mask) -> Index:

@@ -66,10 +66,11 @@ def hovering(job: Job) -> tuple[Arrays, Record]:
     """Judge a tile's points in doubt by what they are parts of in the whole cloud.
 
     Known: the steps of the tests and of the gaps, the files of the things and their gaps, the
-    reach.
+    reach, the ease.
     """
-    tested, measured, file, gaps_file, reach = job.known
+    tested, measured, file, gaps_file, reach, ease = job.known
     few = _few_of(job, job.tile, tested)
+    few = few._replace(margin=protective.eased(few.margin, few.reason, ease))
     groups = things.groups_of(job, job.tile, tested, read_file(job.folder, file))
     gap_m = read_file(job.folder, gaps_file)["gap_m"]
     gap_m = things.gaps_of_groups(job, groups, few.group, measured, gap_m, reach)
@@ -85,7 +86,7 @@ def _few_of(job: Job, tile: Tile, tested: str, judged: str = "") -> Doubtful:
 
 
 def judge(job: Job) -> tuple[Arrays, Record]:
-    """Write down what was found; known: the steps of the tests and of `hovering`, and the reach.
+    """Write down what was found; known: the steps of the tests and of `hovering`, reach and ease.
 
     The tests are of every point that is left, also where only those off the ground are judged.
     The second is None where there are too few points to judge any.
@@ -115,7 +116,7 @@ def judge_spared(job: Job) -> tuple[Arrays, Record]:
 
 
 def _verdict(
-    job: Job, tested: str, judged: str | None, reach: float
+    job: Job, tested: str, judged: str | None, reach: float, ease: float
 ) -> tuple[Values, NDArray[np.uint8]]:
     """Return margin and reason (n,) of every point of the tile that is left."""
     found = read_arrays(job.folder, job.tile, tested, "margin", "few_place")
@@ -126,6 +127,8 @@ def _verdict(
     else:
         few, own = _with_rows(job, tested, judged, reach)
         place = found["few_place"]
+        # Points alone are in doubt.
+        margin = margin / ease
         margin[place], reason[place] = rows_excused(few, own, reach), few.reason[:own]
         reason[margin <= 1.0] = Taken.KEPT
     return margin, reason

@@ -24,7 +24,7 @@ from dougong.filters.lost_places import lost_places
 from dougong.filters.low_outliers import LowOutliers, find_levels, low_notes
 from dougong.filters.octree_voxel_grid import robust_box_of
 from dougong.filters.pass_through import PassThrough, robust_top_of, unknown_notes
-from dougong.filters.protective import is_too_few
+from dougong.filters.protective import ease_notes, ease_of, is_too_few
 from dougong.filters.radius import Radius
 from dougong.filters.ranks import ValueBlocks, count_finite, median
 from dougong.filters.selection import NOISE, Reason
@@ -319,22 +319,23 @@ def _protective(stage: _Stage) -> Outcome:
     known = _protective_found(stage.of_all_left())
     records, key = stage.map("curvature_weighted", protective.judge, known)
     note = _concentration(stage, known[0], key) if stage.asked else None
-    return records, () if note is None else (note,), key
+    return records, (*ease_notes(known[-1]), *(() if note is None else (note,))), key
 
 
-def _protective_found(seen: _Stage) -> tuple[str, str | None, float]:
-    """Return the steps of the tests and of `hovering` of all that is seen, and the reach."""
+def _protective_found(seen: _Stage) -> tuple[str, str | None, float, float]:
+    """Return the steps of the tests and of `hovering` of all that is seen, reach and ease."""
     assert isinstance(seen.params, CurvatureWeighted)
     reach_m = seen.params.reach_m
     reach, eighth = _reach(seen, seen.params)
     _, tested = seen.map("surroundings", protective.test_points, (eighth, reach, seen.low()))
     judged = None
+    ease = ease_of(seen.values(tested, "curvature"), seen.asked, reach_m)
     if not is_too_few(seen.asked, reach_m):
-        judged = _hovering(seen, tested, reach, is_whole=reach_m is None)
-    return tested, judged, reach
+        judged = _hovering(seen, tested, reach, ease, is_whole=reach_m is None)
+    return tested, judged, reach, ease
 
 
-def _hovering(stage: _Stage, tested: str, reach: float, *, is_whole: bool) -> str:
+def _hovering(stage: _Stage, tested: str, reach: float, ease: float, *, is_whole: bool) -> str:
     """Return the step that judges the points in doubt by what they are parts of."""
     cloud = (stage.cloud.folder, stage.cloud.tiles)
     groups, record = stage.kept("groups", lambda _: things.open_groups(*cloud, tested, reach))
@@ -347,7 +348,7 @@ def _hovering(stage: _Stage, tested: str, reach: float, *, is_whole: bool) -> st
     gaps, _ = stage.kept(
         "thing_gaps", lambda _: (things.gaps_of_things(*cloud, file, measured, reach), {})
     )
-    known = (tested, measured, file, gaps, reach)
+    known = (tested, measured, file, gaps, reach, ease)
     return stage.map("hovering", protective.hovering, known)[1]
 
 
