@@ -53,7 +53,8 @@ def partition(
 
     Notes
     -----
-    Memory: about 150 bytes per point of a tile. Disk: 32 bytes per point, twice 36 per kept one.
+    Memory: about 150 bytes per point of a tile, and 32 of the next one, which is read meanwhile.
+    Disk: 32 bytes per point, twice 36 per kept one.
     """
     root = root_cube_of(spool.coordinates, spool.points, params or OctreeVoxelGrid())
     sample, far = _sample_and_far(spool)
